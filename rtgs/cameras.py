@@ -1,0 +1,90 @@
+"""Pinhole cameras and pixel rays: the only place where a pixel centre or a camera axis is defined.
+
+World frame: the capture's own (COLMAP world). Camera frame: x right, y down, z forward. Pixel (i, j), column i and
+row j, has its centre at (i + 0.5, j + 0.5), COLMAP's convention.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Pixel rays of one camera in the world frame: x = origin + depth * directions."""
+
+    origin: Tensor  # (3,) camera centre
+    directions: Tensor  # (H, W, 3), camera-z component 1, so that depth is z-depth; not normalised
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera without distortion (importers undistort).
+
+    ``rotation`` (3, 3) and ``translation`` (3,) are float64 and map world to camera: x_cam = R x + t. Focal lengths and
+    principal point are in pixels of a ``width`` x ``height`` image; fx != fy and an off-centre principal point are legal.
+    """
+
+    rotation: Tensor
+    translation: Tensor
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "rotation", torch.as_tensor(self.rotation, dtype=torch.float64))
+        object.__setattr__(self, "translation", torch.as_tensor(self.translation, dtype=torch.float64))
+        if self.rotation.shape != (3, 3) or self.translation.shape != (3,):
+            raise ValueError(
+                f"camera {self.name!r}: rotation must be (3, 3) and translation (3,), "
+                f"got {tuple(self.rotation.shape)} and {tuple(self.translation.shape)}"
+            )
+        if not (torch.isfinite(self.rotation).all() and torch.isfinite(self.translation).all()):
+            raise ValueError(f"camera {self.name!r}: the pose holds NaN or inf; remove or re-register this image")
+        if self.width < 1 or self.height < 1:
+            raise ValueError(f"camera {self.name!r}: image size {self.width}x{self.height} must be at least 1x1")
+        if not (0 < self.fx < float("inf") and 0 < self.fy < float("inf")):
+            raise ValueError(f"camera {self.name!r}: focal lengths fx={self.fx}, fy={self.fy} must be positive")
+
+    @property
+    def center(self) -> Tensor:
+        """(3,) camera centre in the world frame."""
+        return -self.rotation.T @ self.translation
+
+    def to_camera(self, points: Tensor) -> Tensor:
+        """World points (..., 3) to the camera frame, in the dtype of ``points``."""
+        return points @ self.rotation.T.to(points.dtype) + self.translation.to(points.dtype)
+
+    def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """World points (..., 3) to pixel coordinates (..., 2) and z-depth (...,)."""
+        local = self.to_camera(points)
+        depth = local[..., 2]
+        x = self.fx * local[..., 0] / depth + self.cx
+        y = self.fy * local[..., 1] / depth + self.cy
+        return torch.stack((x, y), dim=-1), depth
+
+    def camera_rays(self, dtype: torch.dtype = torch.float32) -> Tensor:
+        """(H, W, 3) rays through the pixel centres in the camera frame, z component 1."""
+        x = (torch.arange(self.width, dtype=torch.float64) + 0.5 - self.cx) / self.fx
+        y = (torch.arange(self.height, dtype=torch.float64) + 0.5 - self.cy) / self.fy
+        grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
+        return torch.stack((grid_x, grid_y, torch.ones_like(grid_x)), dim=-1).to(dtype)
+
+    def rays(self, dtype: torch.dtype = torch.float32) -> Rays:
+        """Rays through the pixel centres in the world frame."""
+        directions = self.camera_rays(torch.float64) @ self.rotation  # R^T d for each row
+        return Rays(self.center.to(dtype), directions.to(dtype))
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same camera for the image resized to ``width`` x ``height`` (area averaging keeps pixel edges)."""
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy, width=width, height=height
+        )

@@ -1,0 +1,55 @@
+# Kernel sources are compiled once per instruction set (RTGS_ISA = portable | avx2 | avx512) into the namespace
+# rtgs::<isa>; binding sources once, for the baseline. Kernels hold no STL: the linker may keep the AVX-512 copy of a
+# weak template symbol and hand it to an old machine.
+set(RTGS_KERNELS
+  raster_kernels.cpp
+  image_kernels.cpp
+  optimizer_kernels.cpp
+  surfel_kernels.cpp)
+set(RTGS_BINDINGS
+  module.cpp
+  isa.cpp
+  bind_raster.cpp
+  bind_image.cpp
+  bind_optimizer.cpp
+  bind_surfels.cpp)
+
+set(RTGS_ISAS portable)
+set(RTGS_FLAGS_portable "")
+if(CMAKE_SYSTEM_PROCESSOR MATCHES "x86_64|AMD64")
+  list(APPEND RTGS_ISAS avx2 avx512)
+  set(RTGS_FLAGS_avx2 -march=x86-64-v3)
+  set(RTGS_FLAGS_avx512 -march=x86-64-v4 -mprefer-vector-width=512)
+endif()
+
+nanobind_add_module(_core NB_STATIC)
+foreach(source ${RTGS_BINDINGS})
+  if(EXISTS ${RTGS_NATIVE}/${source})
+    target_sources(_core PRIVATE ${RTGS_NATIVE}/${source})
+  endif()
+endforeach()
+target_link_libraries(_core PRIVATE OpenMP::OpenMP_CXX)
+
+foreach(isa ${RTGS_ISAS})
+  set(objects rtgs_kernels_${isa})
+  add_library(${objects} OBJECT)
+  foreach(source ${RTGS_KERNELS})
+    if(EXISTS ${RTGS_NATIVE}/${source})
+      target_sources(${objects} PRIVATE ${RTGS_NATIVE}/${source})
+    endif()
+  endforeach()
+  target_compile_definitions(${objects} PRIVATE RTGS_ISA=${isa} RTGS_ISA_${isa}=1)
+  # fast-math when compiling only: linking with it would set flush-to-zero for the whole Python process.
+  target_compile_options(${objects} PRIVATE -O3 -ffast-math -fno-finite-math-only -Wno-psabi ${RTGS_FLAGS_${isa}})
+  target_link_libraries(${objects} PRIVATE OpenMP::OpenMP_CXX)
+  target_sources(_core PRIVATE $<TARGET_OBJECTS:${objects}>)
+  target_compile_definitions(_core PRIVATE RTGS_HAS_${isa}=1)
+endforeach()
+
+install(TARGETS _core LIBRARY DESTINATION rtgs/native)
+
+# For work on the core: `cmake -DRTGS_IN_SOURCE=ON` puts the module beside its sources.
+option(RTGS_IN_SOURCE "write the module into rtgs/native" OFF)
+if(RTGS_IN_SOURCE)
+  set_target_properties(_core PROPERTIES LIBRARY_OUTPUT_DIRECTORY ${RTGS_NATIVE})
+endif()

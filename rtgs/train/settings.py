@@ -1,0 +1,108 @@
+"""Every number of a training recipe, with its source. Plain frozen dataclasses: the schema of the config (no Hydra here).
+
+Steps count from 0. A stage boundary "from" is the first step at which something is on.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class OptimizerSettings:
+    """Adam, one learning rate per parameter (methods.md 6.1; EnvGS and 2DGS agree)."""
+
+    means_initial: float = 1.6e-4  # times the scene extent
+    means_final: float = 1.6e-6  # times the scene extent; exponential in between over schedule.means_lr_steps
+    sh_dc: float = 2.5e-3
+    sh_rest: float = 1.25e-4
+    opacity_logits: float = 0.05
+    log_scales: float = 5e-3
+    quaternions: float = 1e-3
+    beta1: float = 0.9
+    beta2: float = 0.999
+    eps: float = 1e-15
+
+
+@dataclass(frozen=True)
+class LossSettings:
+    """Weights of the loss terms (methods.md 5). A zero weight means the term is never computed."""
+
+    l1: float = 0.8
+    dssim: float = 0.2
+    normal: float = 0.05  # 2DGS 0.05 from 7,000; RT-GS and EnvGS 0.04 from 0
+    normal_inverse_depth: bool = False  # EnvGS: weight by 1 - (d - p1)/(p99 - p1), clipped, detached
+    mono_normal: float = 0.0  # RT-GS 0.01; only where the scene has normals
+    mono_normal_form: str = "cosine"  # "cosine" (paper: 1 - n.N) or "envgs" (|difference|_1 + 1 - cos)
+    distortion: float = 0.0  # 2DGS: 0 unbounded, 1000 bounded
+
+
+@dataclass(frozen=True)
+class DensitySettings:
+    """Density control (methods.md 6.1, 12)."""
+
+    gradient_threshold: float = 2e-4  # mean norm of the densification signal (NDC)
+    size_border: float = 0.01  # times extent: larger surfels split, smaller ones clone
+    split_count: int = 2
+    split_shrink: float = 1.6  # scales of the children are divided by it
+    min_opacity: float = 0.05
+    too_large: float = 0.1  # times extent; 0 = never
+    too_large_split_count: int = 5
+    too_large_shrink: float = 2.5
+    low_weight_share: float = 0.1  # too large and among the lowest 10 % of mean weight: pruned instead of split
+    reset_opacity: float = 0.01
+    max_surfels: int = 2_000_000
+    cap_share: float = 0.9  # above this share of max_surfels the lowest mean weights go
+
+
+@dataclass(frozen=True)
+class InitSettings:
+    """Initial surfels from points (methods.md 2)."""
+
+    opacity: float = 0.1
+    sh_degree: int = 3
+    neighbors: int = 3
+    min_points: int = 10  # fewer usable points than this: the capture is refused (or random points, if asked for)
+    random_points: int = 0  # > 0: ignore the scene's points, draw this many in the scene box
+
+
+@dataclass(frozen=True)
+class ScheduleSettings:
+    """When things happen, in steps."""
+
+    total: int = 30_000
+    sh_from: int = 0
+    sh_every: int = 1_000
+    densify_from: int = 500
+    densify_until: int = 15_000
+    densify_every: int = 100
+    opacity_reset_every: int = 3_000  # 0 = never; only while densifying
+    normal_from: int = 7_000
+    distortion_from: int = 3_000
+    mono_normal_from: int = 0
+    means_lr_steps: int = 30_000
+    evaluate_every: int = 0  # 0 = at the end only
+    checkpoint_every: int = 500
+
+
+@dataclass(frozen=True)
+class RenderSettings:
+    """Rasteriser settings that scale with the scene."""
+
+    near: float = 0.02  # times the scene extent; methods.md 14: absolute 0.2 breaks small scenes
+    far: float = 20.0  # times the scene extent; distortion mapping only
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    depth_ratio: float = 0.0  # 0 expected depth (unbounded), 1 median depth (bounded objects)
+
+
+@dataclass(frozen=True)
+class MethodSettings:
+    """A method: which recipe, with which numbers. ``name`` selects the class in ``rtgs.methods``."""
+
+    name: str = "2dgs"
+    loss: LossSettings = field(default_factory=LossSettings)
+    optimizer: OptimizerSettings = field(default_factory=OptimizerSettings)
+    density: DensitySettings = field(default_factory=DensitySettings)
+    init: InitSettings = field(default_factory=InitSettings)
+    render: RenderSettings = field(default_factory=RenderSettings)
+    paper_schedule: ScheduleSettings = field(default_factory=ScheduleSettings)  # preset=paper takes this one
