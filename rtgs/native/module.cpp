@@ -3,4 +3,8 @@
 NB_MODULE(_core, m) {
   m.doc() = "rtgs native core: CPU kernels in explicit SIMD, chosen at run time (see rtgs/native/isa.h)";
   rtgs::bind_isa(m);
+  rtgs::bind_image(m);
+  rtgs::bind_surfels(m);
+  rtgs::bind_optimizer(m);
+  rtgs::bind_raster(m);
 }

@@ -2,17 +2,17 @@
 # rtgs::<isa>; binding sources once, for the baseline. Kernels hold no STL: the linker may keep the AVX-512 copy of a
 # weak template symbol and hand it to an old machine.
 set(RTGS_KERNELS
-  raster_kernels.cpp
   image_kernels.cpp
+  surfel_kernels.cpp
   optimizer_kernels.cpp
-  surfel_kernels.cpp)
+  raster_kernels.cpp)
 set(RTGS_BINDINGS
   module.cpp
   isa.cpp
-  bind_raster.cpp
   bind_image.cpp
+  bind_surfels.cpp
   bind_optimizer.cpp
-  bind_surfels.cpp)
+  bind_raster.cpp)
 
 set(RTGS_ISAS portable)
 set(RTGS_FLAGS_portable "")
@@ -23,21 +23,14 @@ if(CMAKE_SYSTEM_PROCESSOR MATCHES "x86_64|AMD64")
 endif()
 
 nanobind_add_module(_core NB_STATIC)
-foreach(source ${RTGS_BINDINGS})
-  if(EXISTS ${RTGS_NATIVE}/${source})
-    target_sources(_core PRIVATE ${RTGS_NATIVE}/${source})
-  endif()
-endforeach()
+list(TRANSFORM RTGS_KERNELS PREPEND ${RTGS_NATIVE}/)
+list(TRANSFORM RTGS_BINDINGS PREPEND ${RTGS_NATIVE}/)
+target_sources(_core PRIVATE ${RTGS_BINDINGS})
 target_link_libraries(_core PRIVATE OpenMP::OpenMP_CXX)
 
 foreach(isa ${RTGS_ISAS})
   set(objects rtgs_kernels_${isa})
-  add_library(${objects} OBJECT)
-  foreach(source ${RTGS_KERNELS})
-    if(EXISTS ${RTGS_NATIVE}/${source})
-      target_sources(${objects} PRIVATE ${RTGS_NATIVE}/${source})
-    endif()
-  endforeach()
+  add_library(${objects} OBJECT ${RTGS_KERNELS})
   target_compile_definitions(${objects} PRIVATE RTGS_ISA=${isa} RTGS_ISA_${isa}=1)
   # fast-math when compiling only: linking with it would set flush-to-zero for the whole Python process.
   target_compile_options(${objects} PRIVATE -O3 -ffast-math -fno-finite-math-only -Wno-psabi ${RTGS_FLAGS_${isa}})

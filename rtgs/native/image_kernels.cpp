@@ -1,0 +1,2 @@
+namespace rtgs::RTGS_ISA {
+}  // namespace rtgs::RTGS_ISA
