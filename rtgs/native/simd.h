@@ -1,0 +1,216 @@
+// One register of floats for each instruction set: AVX-512 (16 lanes), AVX2 (8), anything else through the compiler's
+// vector types (4). Include it in kernel files only; they are compiled once per set into the namespace rtgs::<isa>.
+//
+// vfloat and vint have the usual operators, also with a scalar on one side: `v * 2.f + w`. A comparison gives a vmask
+// through ge/gt/lt/le/eq (not through >=); masks combine with & | and mask_not. Notes on -ffast-math: `/` and sqrt may
+// be Newton-refined estimates (1-2 ulp, 1/0 is NaN), comparisons with NaN are false as they should be.
+#pragma once
+#include <cstdint>
+#include <cstring>
+#if defined(__AVX2__)
+#include <immintrin.h>
+#endif
+
+namespace rtgs::RTGS_ISA {
+
+#if defined(__AVX512F__)
+constexpr int kLanes = 16;
+#elif defined(__AVX2__)
+constexpr int kLanes = 8;
+#else
+constexpr int kLanes = 4;
+#endif
+
+typedef float vfloat __attribute__((vector_size(4 * kLanes)));
+typedef int32_t vint __attribute__((vector_size(4 * kLanes)));
+#if defined(__AVX512F__)
+typedef __mmask16 vmask;
+#else
+typedef vint vmask;  // all bits of a lane, or none
+#endif
+
+// ---- making, loading, storing ----------------------------------------------------------------------------------
+static inline vfloat broadcast(float a) { return vfloat{} + a; }
+static inline vint broadcast_int(int32_t a) { return vint{} + a; }
+static inline vfloat load(const float* p) {  // any alignment
+  vfloat v;
+  memcpy(&v, p, sizeof v);
+  return v;
+}
+static inline void store(float* p, vfloat v) { memcpy(p, &v, sizeof v); }
+static inline vint load_int(const int32_t* p) {
+  vint v;
+  memcpy(&v, p, sizeof v);
+  return v;
+}
+static inline vfloat lane_numbers() {  // 0, 1, 2, ...
+  vfloat v;
+  for (int lane = 0; lane < kLanes; ++lane) v[lane] = float(lane);
+  return v;
+}
+static inline vfloat to_float(vint a) { return __builtin_convertvector(a, vfloat); }
+static inline vint truncate(vfloat a) { return __builtin_convertvector(a, vint); }
+
+#if defined(__AVX512F__)
+// ---- AVX-512 ---------------------------------------------------------------------------------------------------
+static inline vmask ge(vfloat a, vfloat b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_GE_OQ); }
+static inline vmask gt(vfloat a, vfloat b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_GT_OQ); }
+static inline vmask eq(vfloat a, vfloat b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_EQ_OQ); }
+static inline vmask mask_not(vmask m) { return vmask(~m); }
+static inline bool any(vmask m) { return m != 0; }
+static inline uint32_t mask_bits(vmask m) { return m; }
+static inline vmask first_lanes(int count) { return vmask(count >= 16 ? 0xffff : (1u << count) - 1); }
+static inline vfloat select(vmask m, vfloat a, vfloat b) { return (vfloat)_mm512_mask_blend_ps(m, (__m512)b, (__m512)a); }
+static inline vfloat where(vmask m, vfloat a) { return (vfloat)_mm512_maskz_mov_ps(m, (__m512)a); }  // else 0
+static inline vfloat min(vfloat a, vfloat b) { return (vfloat)_mm512_min_ps((__m512)a, (__m512)b); }
+static inline vfloat max(vfloat a, vfloat b) { return (vfloat)_mm512_max_ps((__m512)a, (__m512)b); }
+static inline vfloat fma(vfloat a, vfloat b, vfloat c) { return (vfloat)_mm512_fmadd_ps((__m512)a, (__m512)b, (__m512)c); }
+static inline vfloat round(vfloat a) { return (vfloat)_mm512_roundscale_ps((__m512)a, 8); }
+static inline vfloat sqrt(vfloat a) { return (vfloat)_mm512_sqrt_round_ps((__m512)a, 8); }
+static inline vfloat scale_by_power(vfloat a, vfloat n) { return (vfloat)_mm512_scalef_ps((__m512)a, (__m512)n); }
+static inline vfloat gather(const float* p, vint index) { return (vfloat)_mm512_i32gather_ps((__m512i)index, p, 4); }
+static inline vfloat load_first(const float* p, int count) { return (vfloat)_mm512_maskz_loadu_ps(first_lanes(count), p); }
+static inline void store_first(float* p, vfloat v, int count) { _mm512_mask_storeu_ps(p, first_lanes(count), (__m512)v); }
+// 1/a within 1.5 ulp for normal a (estimate and one Newton step); a = 0 or inf gives NaN.
+static inline vfloat reciprocal(vfloat a) {
+  __m512 r = _mm512_rcp14_ps((__m512)a);
+  __m512 e = _mm512_fnmadd_ps((__m512)a, r, _mm512_set1_ps(1.f));
+  return (vfloat)_mm512_fmadd_ps(r, e, r);
+}
+
+#elif defined(__AVX2__)
+// ---- AVX2 ------------------------------------------------------------------------------------------------------
+static inline vmask ge(vfloat a, vfloat b) { return (vmask)_mm256_cmp_ps((__m256)a, (__m256)b, _CMP_GE_OQ); }
+static inline vmask gt(vfloat a, vfloat b) { return (vmask)_mm256_cmp_ps((__m256)a, (__m256)b, _CMP_GT_OQ); }
+static inline vmask eq(vfloat a, vfloat b) { return (vmask)_mm256_cmp_ps((__m256)a, (__m256)b, _CMP_EQ_OQ); }
+static inline vmask mask_not(vmask m) { return ~m; }
+static inline bool any(vmask m) { return _mm256_movemask_ps((__m256)m) != 0; }
+static inline uint32_t mask_bits(vmask m) { return uint32_t(_mm256_movemask_ps((__m256)m)); }
+static inline vmask first_lanes(int count) { return vint{0, 1, 2, 3, 4, 5, 6, 7} < count; }
+static inline vfloat select(vmask m, vfloat a, vfloat b) { return (vfloat)_mm256_blendv_ps((__m256)b, (__m256)a, (__m256)m); }
+static inline vfloat where(vmask m, vfloat a) { return (vfloat)((vint)a & m); }  // else 0
+static inline vfloat min(vfloat a, vfloat b) { return (vfloat)_mm256_min_ps((__m256)a, (__m256)b); }
+static inline vfloat max(vfloat a, vfloat b) { return (vfloat)_mm256_max_ps((__m256)a, (__m256)b); }
+static inline vfloat fma(vfloat a, vfloat b, vfloat c) { return (vfloat)_mm256_fmadd_ps((__m256)a, (__m256)b, (__m256)c); }
+static inline vfloat round(vfloat a) { return (vfloat)_mm256_round_ps((__m256)a, 8); }
+static inline vfloat sqrt(vfloat a) { return (vfloat)_mm256_sqrt_ps((__m256)a); }
+static inline vfloat scale_by_power(vfloat a, vfloat n) {  // n whole; result a 2^n for n in [-126, 127]
+  __m256i e = _mm256_slli_epi32(_mm256_cvtps_epi32((__m256)n), 23);
+  return a * (vfloat)_mm256_castsi256_ps(_mm256_add_epi32(e, _mm256_set1_epi32(127 << 23)));
+}
+static inline vfloat gather(const float* p, vint index) { return (vfloat)_mm256_i32gather_ps(p, (__m256i)index, 4); }
+static inline vfloat load_first(const float* p, int count) {
+  return (vfloat)_mm256_maskload_ps(p, (__m256i)first_lanes(count));
+}
+static inline void store_first(float* p, vfloat v, int count) {
+  _mm256_maskstore_ps(p, (__m256i)first_lanes(count), (__m256)v);
+}
+static inline vfloat reciprocal(vfloat a) { return 1.f / a; }
+
+#else
+// ---- portable: 4 lanes, what SSE2 and NEON hold ----------------------------------------------------------------
+static inline vmask ge(vfloat a, vfloat b) { return a >= b; }
+static inline vmask gt(vfloat a, vfloat b) { return a > b; }
+static inline vmask eq(vfloat a, vfloat b) { return a == b; }
+static inline vmask mask_not(vmask m) { return ~m; }
+static inline bool any(vmask m) { return (m[0] | m[1] | m[2] | m[3]) != 0; }
+static inline uint32_t mask_bits(vmask m) {
+  return uint32_t((m[0] & 1) | (m[1] & 2) | (m[2] & 4) | (m[3] & 8));
+}
+static inline vmask first_lanes(int count) { return vint{0, 1, 2, 3} < count; }
+static inline vfloat select(vmask m, vfloat a, vfloat b) { return (vfloat)(((vint)a & m) | ((vint)b & ~m)); }
+static inline vfloat where(vmask m, vfloat a) { return (vfloat)((vint)a & m); }  // else 0
+static inline vfloat min(vfloat a, vfloat b) { return select(a < b, a, b); }
+static inline vfloat max(vfloat a, vfloat b) { return select(a > b, a, b); }
+static inline vfloat fma(vfloat a, vfloat b, vfloat c) { return a * b + c; }  // rounds twice
+static inline vfloat round(vfloat a) {                                       // |a| < 2^31; halves away from zero
+  return to_float(truncate(a + select(a >= broadcast(0.f), broadcast(0.5f), broadcast(-0.5f))));
+}
+static inline vfloat sqrt(vfloat a) {
+  for (int lane = 0; lane < kLanes; ++lane) a[lane] = __builtin_sqrtf(a[lane]);
+  return a;
+}
+static inline vfloat scale_by_power(vfloat a, vfloat n) { return a * (vfloat)((truncate(n) + 127) << 23); }
+static inline vfloat gather(const float* p, vint index) { return vfloat{p[index[0]], p[index[1]], p[index[2]], p[index[3]]}; }
+static inline vfloat load_first(const float* p, int count) {
+  vfloat v{};
+  for (int lane = 0; lane < kLanes; ++lane)
+    if (lane < count) v[lane] = p[lane];
+  return v;
+}
+static inline void store_first(float* p, vfloat v, int count) {
+  for (int lane = 0; lane < kLanes; ++lane)
+    if (lane < count) p[lane] = v[lane];
+}
+static inline vfloat reciprocal(vfloat a) { return 1.f / a; }
+#endif
+
+// ---- for all sets ----------------------------------------------------------------------------------------------
+static inline vmask lt(vfloat a, vfloat b) { return gt(b, a); }
+static inline vmask le(vfloat a, vfloat b) { return ge(b, a); }
+static inline vfloat abs(vfloat a) { return (vfloat)((vint)a & 0x7fffffff); }
+static inline vfloat clamp(vfloat a, float low, float high) { return min(max(a, broadcast(low)), broadcast(high)); }
+
+// Lane k = p[k * stride]: one component of kLanes consecutive rows.
+static inline vfloat load_strided(const float* p, int stride) { return gather(p, truncate(lane_numbers()) * stride); }
+
+// exp(a), relative error <= 3e-7 (portable: 4e-6 where |a| is large); a is clamped to [-87, 88].
+static inline vfloat exp(vfloat a) {
+  constexpr float kLog2E = 1.44269504088896341f, kLog2ERest = 1.925963033500e-8f;
+  a = clamp(a, -87.f, 88.f);
+  vfloat t = a * kLog2E, n = round(t);
+  vfloat f = (t - n) + fma(a, broadcast(kLog2E), -t) + a * kLog2ERest;  // with what rounding t and log2(e) lost
+  vfloat p = broadcast(0.0001534581242594868f);        // minimax polynomial of 2^f on [-1/2, 1/2]
+  p = fma(p, f, broadcast(0.0013399930903688073f));
+  p = fma(p, f, broadcast(0.009618489071726799f));
+  p = fma(p, f, broadcast(0.05550328642129898f));
+  p = fma(p, f, broadcast(0.24022646248340607f));
+  p = fma(p, f, broadcast(0.6931471824645996f));
+  p = fma(p, f, broadcast(1.f));
+  return scale_by_power(p, n);
+}
+static inline vfloat sigmoid(vfloat a) { return 1.f / (1.f + exp(-a)); }
+
+// ---- horizontal sums -------------------------------------------------------------------------------------------
+template <int...>
+struct LaneList {};
+template <int N, int... I>
+struct MakeLanes : MakeLanes<N - 1, N - 1, I...> {};
+template <int... I>
+struct MakeLanes<0, I...> {
+  typedef LaneList<I...> type;
+};
+
+// Sums neighbouring groups of S lanes: groups of a come out as the first halves, groups of b as the second ones.
+template <int S, int... I>
+static inline vfloat add_groups(vfloat a, vfloat b, LaneList<I...>) {
+  constexpr auto lane = [](int i, int half) {  // the lane of (a, b) that lands in lane i
+    return (i % (2 * S) < S ? 0 : kLanes - S) + i + half * S;
+  };
+#if defined(__clang__)
+  return __builtin_shufflevector(a, b, lane(I, 0)...) + __builtin_shufflevector(a, b, lane(I, 1)...);
+#else
+  return __builtin_shuffle(a, b, vint{lane(I, 0)...}) + __builtin_shuffle(a, b, vint{lane(I, 1)...});
+#endif
+}
+template <int S>
+static inline vfloat add_groups(vfloat a, vfloat b) {
+  return add_groups<S>(a, b, typename MakeLanes<kLanes>::type{});
+}
+
+// Transpose and add: lane k of the result is the sum over the lanes of v[k], k = 0 .. kLanes - 1, in a fixed order.
+template <int S = kLanes / 2>
+static inline vfloat sums_of(const vfloat* v) {
+  vfloat half[S];
+#pragma GCC unroll 16
+  for (int k = 0; k < S; ++k) half[k] = add_groups<S>(v[k], v[k + S]);
+  if constexpr (S == 1) return half[0];
+  else return sums_of<S / 2>(half);
+}
+static inline float sum(vfloat a) {
+  float total = 0.f;
+  for (int lane = 0; lane < kLanes; ++lane) total += a[lane];
+  return total;
+}
+
+}  // namespace rtgs::RTGS_ISA
