@@ -1,0 +1,60 @@
+# Every target makes its own environment first: a fresh clone + `make demo` or `make test` is all the set-up there is.
+PYTHON ?= python3
+TORCH ?= torch==2.13.0
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+NATIVE := $(wildcard rtgs/native/*.cpp rtgs/native/*.h rtgs/native/*.cmake) CMakeLists.txt pyproject.toml
+RUN ?=
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test e2e bench lint format dashboard accept-steps clean
+
+help: ## list the targets
+	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-14s %s\n", $$1, $$2}'
+
+setup: $(READY) ## make .venv with everything, native core built
+
+$(READY): $(NATIVE)
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "rtgs needs Python 3.11 or newer; $$($(PYTHON) --version) is '$(PYTHON)'. Try: make PYTHON=python3.11 $(MAKECMDGOALS)"; exit 1; }
+	@command -v "$${CXX:-c++}" >/dev/null || \
+	  { echo "rtgs builds a native core and found no C++ compiler ('$${CXX:-c++}'). Install one: Debian/Ubuntu 'apt install g++', Fedora 'dnf install gcc-c++', macOS 'xcode-select --install'; or set CXX."; exit 1; }
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install -q --upgrade pip
+	$(BIN)/pip install -q "$(TORCH)"
+	$(BIN)/pip install -q -e '.[dev,synthetic]'
+	@touch $(READY)
+
+demo: setup ## train the embedded glass scene, end with a page of pictures and numbers (under 5 minutes)
+	$(BIN)/rtgs run scene=demo method=rtgs preset=quick $(RUN)
+
+test: setup ## the tests
+	$(BIN)/python -m pytest -n 2 --dist loadfile
+
+e2e: setup ## long end-to-end runs
+	$(BIN)/python -m pytest -m slow
+
+bench: setup ## speed and error figures, each a JSON object on its last line
+	$(BIN)/python -m benchmarks.raster
+	$(BIN)/python -m benchmarks.losses
+	$(BIN)/python -m benchmarks.gaussians
+	$(BIN)/python -m benchmarks.train_step
+
+lint: setup ## ruff and pyright
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+
+format: setup ## let ruff put things right
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+dashboard: setup ## browse the runs in MLflow on http://127.0.0.1:5000
+	$(BIN)/mlflow ui --host 127.0.0.1 --port 5000 --backend-store-uri sqlite:///mlflow.db
+
+accept-steps: setup ## accept the changed source of pipeline steps (after bumping a version, or when the output is the same)
+	$(BIN)/python -m tests.pipelines.accept_steps
+
+clean: ## remove the environment and build products (not the store)
+	rm -rf $(VENV) build

@@ -1,0 +1,42 @@
+"""Camera rings around a target, in order of capture."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from rtgs.cameras import Camera
+from rtgs.scenes.synthetic.description import Viewpoints
+
+
+def look_at(position: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """World-to-camera rotation and translation (x right, y down, z forward) of a camera in a z-up world."""
+    forward = (target - position) / np.linalg.norm(target - position)
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    rotation = np.stack((right, np.cross(forward, right), forward))
+    return rotation, -rotation @ position
+
+
+def cameras(viewpoints: Viewpoints, width: int, height: int, seed: int = 0) -> list[Camera]:
+    """Jittered cameras on ``rings`` of increasing elevation; neighbours in name order are neighbours in space."""
+    rng = np.random.default_rng(seed)
+    target = np.asarray(viewpoints.target, float)
+    focal = 0.5 * width / np.tan(np.radians(viewpoints.field_of_view) / 2)
+    made = []
+    for index in range(viewpoints.count):
+        turn, ring = divmod(index * viewpoints.rings, viewpoints.count)
+        share = (ring / viewpoints.count) if viewpoints.rings > 1 else index / viewpoints.count
+        elevation = np.radians(np.interp(turn, (0, max(viewpoints.rings - 1, 1)), viewpoints.elevation))
+        azimuth = 2 * np.pi * (share + turn / (2 * viewpoints.rings)) + rng.normal(0, 0.03)
+        radius = rng.uniform(*viewpoints.radius)
+        offset = np.array((np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)))
+        jitter = viewpoints.jitter * viewpoints.radius[0] * rng.normal(0, 0.5, 3)
+        rotation, translation = look_at(target + radius * offset, target + jitter)
+        made.append(
+            Camera(
+                torch.from_numpy(rotation), torch.from_numpy(translation), focal, focal, width / 2, height / 2,
+                width, height, name=f"view_{index:03d}",
+            )
+        )  # fmt: skip
+    return made
