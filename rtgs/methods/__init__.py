@@ -1,0 +1,60 @@
+"""The systems of the tables: one file each, created by the name that the config gives."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+
+from rtgs.methods.base import (
+    Decision,
+    LossTerm,
+    LossTerms,
+    Method,
+    RenderedView,
+    RenderOptions,
+    Stage,
+    StepEvent,
+)
+from rtgs.train.settings import MethodSettings, ScheduleSettings
+
+if TYPE_CHECKING:
+    from rtgs.scenes.scene import Scene
+
+METHOD_NAMES = ("2dgs", "rtgs")
+
+
+def create_method(
+    settings: MethodSettings, scene: Scene, schedule: ScheduleSettings, generator: torch.Generator
+) -> Method:
+    """The method ``settings.name``, its surfels initialised from the scene's points.
+
+    ``schedule`` decides when losses and density control are on; ``generator`` is drawn from at initialisation and by
+    density control, and its state travels in checkpoints.
+
+    Raises:
+        ValueError: no method has this name.
+    """
+    if settings.name == "2dgs":
+        from rtgs.methods.gs2d import Gs2d
+
+        return Gs2d(settings, scene, schedule, generator)
+    if settings.name == "rtgs":
+        from rtgs.methods.rtgs import RtGs
+
+        return RtGs(settings, scene, schedule, generator)
+    raise ValueError(f"method.name is {settings.name!r}: choose one of {', '.join(METHOD_NAMES)}")
+
+
+__all__ = [
+    "METHOD_NAMES",
+    "Decision",
+    "LossTerm",
+    "LossTerms",
+    "Method",
+    "RenderOptions",
+    "RenderedView",
+    "Stage",
+    "StepEvent",
+    "create_method",
+]

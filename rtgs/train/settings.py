@@ -1,4 +1,4 @@
-"""Every number of a training recipe, with its source. Plain frozen dataclasses: the schema of the config (no Hydra here).
+"""Every number of a training recipe, with its source. Plain frozen dataclasses: the config schema (no Hydra here).
 
 Steps count from 0. A stage boundary "from" is the first step at which something is on.
 """
@@ -22,19 +22,30 @@ class OptimizerSettings:
     beta1: float = 0.9
     beta2: float = 0.999
     eps: float = 1e-15
+    # Ranges the raw parameters are clamped to after every step, so that the activations stay finite (methods.md 14).
+    opacity_logit_limit: float = 13.8  # sigmoid within 1e-6 of 0 and 1
+    smallest_scale: float = 1e-6  # times the scene extent
+    largest_scale: float = 100.0  # times the scene extent
 
 
 @dataclass(frozen=True)
 class LossSettings:
-    """Weights of the loss terms (methods.md 5). A zero weight means the term is never computed."""
+    """Weights of the loss terms (methods.md 5). A zero weight means the term is never computed.
+
+    ``*_start`` is the share of the run's total steps after which a term is on: the one kind of boundary that keeps its
+    sense when a run shrinks from 60,000 steps to 2,000, so methods own it and presets do not repeat it.
+    """
 
     l1: float = 0.8
     dssim: float = 0.2
-    normal: float = 0.05  # 2DGS 0.05 from 7,000; RT-GS and EnvGS 0.04 from 0
+    normal: float = 0.05  # 2DGS 0.05; RT-GS and EnvGS 0.04
+    normal_start: float = 7 / 30  # 2DGS: from 7,000 of 30,000; EnvGS: from 0
     normal_inverse_depth: bool = False  # EnvGS: weight by 1 - (d - p1)/(p99 - p1), clipped, detached
     mono_normal: float = 0.0  # RT-GS 0.01; only where the scene has normals
+    mono_normal_start: float = 0.0  # EnvGS: from 0
     mono_normal_form: str = "cosine"  # "cosine" (paper: 1 - n.N) or "envgs" (|difference|_1 + 1 - cos)
     distortion: float = 0.0  # 2DGS: 0 unbounded, 1000 bounded
+    distortion_start: float = 0.1  # 2DGS: from 3,000 of 30,000
 
 
 @dataclass(frozen=True)
@@ -77,9 +88,6 @@ class ScheduleSettings:
     densify_until: int = 15_000
     densify_every: int = 100
     opacity_reset_every: int = 3_000  # 0 = never; only while densifying
-    normal_from: int = 7_000
-    distortion_from: int = 3_000
-    mono_normal_from: int = 0
     means_lr_steps: int = 30_000
     evaluate_every: int = 0  # 0 = at the end only
     checkpoint_every: int = 500

@@ -1,0 +1,112 @@
+"""What a method is: the protocol between a recipe and the one training loop that trains them all."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+from torch import Tensor
+
+from rtgs.cameras import Camera
+from rtgs.render.buffers import RasterBuffers
+from rtgs.train.settings import MethodSettings, ScheduleSettings
+
+if TYPE_CHECKING:
+    from rtgs.methods.surfel_set import SurfelSet
+    from rtgs.scenes.scene import View
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A stretch of training that is one pipeline step of its own (the artifact in between is cached)."""
+
+    name: str
+    from_step: int  # first step of the stage
+    until: int  # first step that no longer belongs to it
+
+
+@dataclass(frozen=True)
+class Decision:
+    """Something a recipe could do and does not (or does differently), decided once: shown in the log and the report."""
+
+    what: str
+    why: str
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """Optional maps of one rendered view. Training leaves this to the method: what its losses need at this step."""
+
+    depth: bool = False
+    median_depth: bool = False
+    normal: bool = False
+    distortion: bool = False
+
+
+@dataclass(frozen=True)
+class RenderedView:
+    """What a method shows from one camera."""
+
+    camera: Camera
+    image: Tensor  # (3, H, W) sRGB, not clamped
+    buffers: RasterBuffers  # of the base set; maps that were not asked for are None
+
+
+@dataclass(frozen=True)
+class LossTerm:
+    """One weighted term of the loss, for the log and for the guard."""
+
+    name: str
+    value: Tensor  # scalar, detached, before the weight
+    weight: float
+
+
+@dataclass(frozen=True)
+class LossTerms:
+    """The loss of one step."""
+
+    total: Tensor  # scalar with its graph: the weighted sum of the terms
+    terms: tuple[LossTerm, ...]
+
+
+@dataclass(frozen=True)
+class StepEvent:
+    """A change of a set between two steps worth a line in the log: density control, an opacity reset."""
+
+    kind: str  # "density" or "opacity_reset"
+    set_name: str
+    detail: str
+
+
+class Method(Protocol):
+    """A composition of sets, shading, losses and schedule. The trainer knows no method by name.
+
+    ``state`` is a flat mapping from dotted names to tensors, as safetensors wants it: everything :meth:`load` needs to
+    go on bit for bit.
+    """
+
+    settings: MethodSettings
+    schedule: ScheduleSettings
+    stages: tuple[Stage, ...]
+    decisions: tuple[Decision, ...]
+
+    @property
+    def sets(self) -> tuple[SurfelSet, ...]:
+        """The sets of surfels in training, each with its optimiser and density control."""
+        ...
+
+    def render(self, camera: Camera, step: int, options: RenderOptions | None = None) -> RenderedView:
+        """Render one view as of ``step``. ``options=None``: the outputs that the losses of this step need."""
+        ...
+
+    def losses(self, rendered: RenderedView, view: View, step: int) -> LossTerms:
+        """The loss of a view rendered with ``options=None`` at the same step."""
+        ...
+
+    def after_step(self, step: int) -> tuple[StepEvent, ...]:
+        """After the backward pass: Adam, then density control as the schedule asks before step ``step + 1``."""
+        ...
+
+    def state(self) -> dict[str, Tensor]: ...
+
+    def load(self, state: dict[str, Tensor]) -> None: ...

@@ -1,0 +1,227 @@
+"""The first stage that every surfel method shares: one base set, rasterised, with photometric and geometric losses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from rtgs.cameras import Camera
+from rtgs.gaussians.initialize import surfels_from_points
+from rtgs.methods.base import Decision, LossTerm, LossTerms, RenderedView, RenderOptions, Stage, StepEvent
+from rtgs.methods.surfel_set import SurfelSet
+from rtgs.render.buffers import RasterBuffers, RasterOptions
+from rtgs.render.rasterize import rasterize_surfels
+from rtgs.train.losses import distortion_loss, mono_normal_loss, normal_consistency_loss, photometric_loss
+from rtgs.train.schedule import check_schedule, densify_due, loss_start, opacity_reset_due, sh_degree_at
+from rtgs.train.settings import MethodSettings, ScheduleSettings
+
+if TYPE_CHECKING:
+    from rtgs.scenes.scene import Scene, View
+
+
+@dataclass(frozen=True)
+class LossStarts:
+    """First step of each geometric loss; None: never in this run."""
+
+    normal: int | None
+    mono_normal: int | None
+    distortion: int | None
+
+
+def _on(start: int | None, step: int) -> bool:
+    return start is not None and step >= start
+
+
+class SurfelMethod:
+    """A base set of surfels from the scene's points, rendered by rasterisation (methods.md 3.1).
+
+    Subclasses add sets, shading and stages; this class alone is 2DGS.
+    """
+
+    def __init__(
+        self, settings: MethodSettings, scene: Scene, schedule: ScheduleSettings, generator: torch.Generator
+    ) -> None:
+        check_schedule(schedule)
+        self.settings = settings
+        self.schedule = schedule
+        self.generator = generator
+        self.extent = scene.extent
+        self.base = SurfelSet(
+            "base",
+            surfels_from_points(scene.points, scene.point_colors, settings.init, generator),
+            optimizer=settings.optimizer,
+            density=settings.density,
+            means_lr_steps=schedule.means_lr_steps,
+            extent=scene.extent,
+        )
+        self.stages: tuple[Stage, ...] = (Stage("diffuse", 0, schedule.total),)
+        self.starts, decisions = _decide_losses(settings, scene, schedule)
+        self.decisions: tuple[Decision, ...] = decisions
+        self._background = torch.tensor(settings.render.background)
+
+    @property
+    def sets(self) -> tuple[SurfelSet, ...]:
+        return (self.base,)
+
+    def sh_degree(self, step: int) -> int:
+        """SH degree in use at ``step``."""
+        return sh_degree_at(self.schedule, step, self.base.surfels.sh_degree)
+
+    def training_options(self, step: int) -> RenderOptions:
+        """The maps that the losses of this step need, and no others."""
+        normal = _on(self.starts.normal, step)
+        ratio = self.settings.render.depth_ratio
+        return RenderOptions(
+            depth=normal and ratio < 1,
+            median_depth=normal and ratio > 0,
+            normal=normal or _on(self.starts.mono_normal, step),
+            distortion=_on(self.starts.distortion, step),
+        )
+
+    def render(self, camera: Camera, step: int, options: RenderOptions | None = None) -> RenderedView:
+        """Render one view; with ``options=None`` (training) density control watches it."""
+        buffers = self.rasterize_base(camera, step, options)
+        return RenderedView(camera, buffers.features, buffers)
+
+    def rasterize_base(self, camera: Camera, step: int, options: RenderOptions | None) -> RasterBuffers:
+        """Rasterise the base set: its SH colours as features."""
+        training = options is None
+        wanted = self.training_options(step) if options is None else options
+        surfels = self.base.activated(camera.center.float(), self.sh_degree(step))
+        probe = self.base.new_probe() if training else None
+        buffers = rasterize_surfels(
+            surfels.means,
+            surfels.tangent_u,
+            surfels.tangent_v,
+            surfels.scales,
+            surfels.opacities,
+            surfels.colors,
+            camera,
+            background=self._background,
+            options=self.raster_options(wanted, weight_sum=training),
+            screen_probe=probe,
+        )
+        if probe is not None and buffers.weight_sum is not None:
+            self.base.watch(probe, buffers.weight_sum)
+        return buffers
+
+    def raster_options(self, wanted: RenderOptions, *, weight_sum: bool) -> RasterOptions:
+        """The rasteriser's options: near and far in world units of this scene."""
+        render = self.settings.render
+        return RasterOptions(
+            near=render.near * self.extent,
+            far=render.far * self.extent,
+            depth=wanted.depth,
+            median_depth=wanted.median_depth,
+            normal=wanted.normal,
+            distortion=wanted.distortion,
+            weight_sum=weight_sum,
+        )
+
+    def surface_depth(self, buffers: RasterBuffers) -> Tensor:
+        """(H, W) accumulated depth (sum of w z) of the surface: expected, median or a mix (``render.depth_ratio``)."""
+        ratio = self.settings.render.depth_ratio
+        if ratio == 0 and buffers.depth is not None:
+            return buffers.depth
+        assert buffers.median_depth is not None, "rendered without the median depth that depth_ratio > 0 needs"
+        median = buffers.median_depth * buffers.alpha.detach()
+        return median if buffers.depth is None else (1 - ratio) * buffers.depth + ratio * median
+
+    def losses(self, rendered: RenderedView, view: View, step: int) -> LossTerms:
+        """L1 and D-SSIM always; normal consistency, monocular normals, distortion as decided (methods.md 5)."""
+        weights = self.settings.loss
+        buffers = rendered.buffers
+        photometric = photometric_loss(rendered.image, view.image, weights.l1, weights.dssim)
+        total = photometric.total
+        terms = [LossTerm("l1", photometric.l1, weights.l1), LossTerm("dssim", photometric.dssim, weights.dssim)]
+
+        def add(name: str, value: Tensor, weight: float) -> None:
+            nonlocal total
+            total = total + weight * value
+            terms.append(LossTerm(name, value.detach(), weight))
+
+        if _on(self.starts.normal, step):
+            assert buffers.normal is not None
+            value = normal_consistency_loss(
+                buffers.normal,
+                self.surface_depth(buffers),
+                buffers.alpha,
+                rendered.camera,
+                inverse_depth_weight=weights.normal_inverse_depth,
+            )
+            add("normal", value, weights.normal)
+        if _on(self.starts.mono_normal, step) and view.normal is not None:
+            assert buffers.normal is not None
+            value = mono_normal_loss(buffers.normal, view.normal, rendered.camera, form=weights.mono_normal_form)
+            add("mono_normal", value, weights.mono_normal)
+        if _on(self.starts.distortion, step):
+            assert buffers.distortion is not None
+            add("distortion", distortion_loss(buffers.distortion), weights.distortion)
+        return LossTerms(total, tuple(terms))
+
+    def after_step(self, step: int) -> tuple[StepEvent, ...]:
+        """Adam, then what the schedule asks of the base set before the next step."""
+        self.base.step(step)
+        following = step + 1
+        events = []
+        if densify_due(self.schedule, following):
+            report = self.base.densify(self.generator)
+            detail = f"{report.cloned} cloned, {report.split} split, {report.pruned} pruned, {report.total} surfels"
+            events.append(StepEvent("density", self.base.name, detail))
+        if opacity_reset_due(self.schedule, following):
+            self.base.reset_opacity()
+            detail = f"opacities lowered to {self.settings.density.reset_opacity}"
+            events.append(StepEvent("opacity_reset", self.base.name, detail))
+        return tuple(events)
+
+    def state(self) -> dict[str, Tensor]:
+        """Flat mapping of every tensor that training needs to go on, generator included."""
+        tensors = {"generator": self.generator.get_state()}
+        for surfel_set in self.sets:
+            tensors.update(surfel_set.state())
+        return tensors
+
+    def load(self, state: dict[str, Tensor]) -> None:
+        """Go on from :meth:`state`."""
+        self.generator.set_state(state["generator"])
+        for surfel_set in self.sets:
+            surfel_set.load(state)
+
+
+def _decide_losses(
+    settings: MethodSettings, scene: Scene, schedule: ScheduleSettings
+) -> tuple[LossStarts, tuple[Decision, ...]]:
+    """Which geometric losses this run computes and from when; what is left out, with the reason."""
+    loss = settings.loss
+    decisions: list[Decision] = []
+
+    def start(name: str, weight: float, share: float) -> int | None:
+        if weight == 0:
+            decisions.append(Decision(f"no {name} loss", f"its weight is 0 in method {settings.name}"))
+            return None
+        first = loss_start(share, schedule.total)
+        if first >= schedule.total:
+            decisions.append(
+                Decision(f"no {name} loss", f"it starts after {share:g} of the run, beyond {schedule.total} steps")
+            )
+            return None
+        return first
+
+    normal = start("normal consistency", loss.normal, loss.normal_start)
+    distortion = start("distortion", loss.distortion, loss.distortion_start)
+    mono = start("monocular normal", loss.mono_normal, loss.mono_normal_start)
+    without = sum(view.normal is None for view in scene.train)
+    if mono is not None and without:
+        if without == len(scene.train):
+            mono = None
+        which = "no training view has" if mono is None else f"{without} of {len(scene.train)} training views lack"
+        decisions.append(
+            Decision(
+                "no monocular normal loss" + ("" if mono is None else " on some views"),
+                f"{which} a normal map in scene {scene.name}",
+            )
+        )
+    return LossStarts(normal, mono, distortion), tuple(decisions)

@@ -1,0 +1,126 @@
+"""A set of surfels in training: parameters, their optimiser, their density control. Every method is made of these."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from rtgs.gaussians.activate import activate_surfels
+from rtgs.gaussians.density import DensityControl, DensityReport
+from rtgs.gaussians.surfels import ActivatedSurfels, Surfels
+from rtgs.train.adam import SurfelAdam
+from rtgs.train.settings import DensitySettings, OptimizerSettings
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What density control learns from one rendered training view."""
+
+    probe: Tensor  # (N, 2); after the backward pass its gradient is the densification signal
+    weight_sum: Tensor  # (N,)
+
+
+class SurfelSet:
+    """Surfels + :class:`SurfelAdam` + :class:`DensityControl`, kept consistent through every change of N.
+
+    ``name`` prefixes its tensors in a checkpoint and its lines in reports; ``extent`` is the scene's, world units.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        surfels: Surfels,
+        *,
+        optimizer: OptimizerSettings,
+        density: DensitySettings,
+        means_lr_steps: int,
+        extent: float,
+    ) -> None:
+        self.name = name
+        self.surfels = surfels.requires_grad_()
+        self.extent = extent
+        self._optimizer_settings = optimizer
+        self.optimizer = SurfelAdam(self.surfels, optimizer, extent, means_lr_steps)
+        self.density = DensityControl(density, extent)
+        self._observation: Observation | None = None
+
+    def __len__(self) -> int:
+        return len(self.surfels)
+
+    def activated(self, camera_center: Tensor, sh_degree: int) -> ActivatedSurfels:
+        """Activated surfels as seen from ``camera_center`` (3,) world, SH up to ``sh_degree``."""
+        return activate_surfels(self.surfels, camera_center, sh_degree)
+
+    def new_probe(self) -> Tensor:
+        """A (N, 2) zero tensor to hand to the renderer of a training view."""
+        return torch.zeros(len(self), 2, requires_grad=True)
+
+    def watch(self, probe: Tensor, weight_sum: Tensor) -> None:
+        """Remember what the renderer of this step's view returned, until :meth:`step`."""
+        self._observation = Observation(probe, weight_sum)
+
+    def step(self, step: int) -> None:
+        """Hand the view's signal to density control, then one step of Adam and the clamps that keep values finite."""
+        if self._observation is not None and self._observation.probe.grad is not None:
+            self.density.observe(self._observation.probe.grad, self._observation.weight_sum)
+        self._observation = None
+        self.optimizer.step(step)
+        self.optimizer.zero_grad()
+        self._clamp()
+
+    def densify(self, generator: torch.Generator) -> DensityReport:
+        """Clone, split, prune with the signal gathered since the last call."""
+        return self.density.densify(self.surfels, self.optimizer, generator)
+
+    def reset_opacity(self) -> None:
+        """Lower every opacity to the settings' reset value."""
+        self.density.reset_opacity(self.surfels, self.optimizer)
+
+    @torch.no_grad()
+    def _clamp(self) -> None:
+        """Keep the activations finite whatever the learning rate (methods.md 14).
+
+        exp overflows float32 at 88, and a logit beyond 13.8 has a sigmoid derivative below 1e-6 from which Adam cannot
+        return; the other parameters are used as they are, and Adam bounds their drift by learning rate times steps.
+        """
+        limits = self._optimizer_settings
+        smallest, largest = (math.log(share * self.extent) for share in (limits.smallest_scale, limits.largest_scale))
+        self.surfels.log_scales.clamp_(smallest, largest)
+        self.surfels.opacity_logits.clamp_(-limits.opacity_logit_limit, limits.opacity_logit_limit)
+
+    def state(self) -> dict[str, Tensor]:
+        """Every tensor of the set under dotted names."""
+        parts = {
+            "surfels": {name: tensor.detach() for name, tensor in self.surfels.items()},
+            "adam": self.optimizer.state(),
+            "density": self.density.state(),
+        }
+        return {
+            f"{self.name}.{part}.{name}": tensor for part, tensors in parts.items() for name, tensor in tensors.items()
+        }
+
+    def load(self, state: dict[str, Tensor]) -> None:
+        """Take over the tensors of :meth:`state`, whatever the number of surfels now.
+
+        Raises:
+            ValueError: a parameter of this set is missing in ``state``.
+        """
+
+        def part(key: str) -> dict[str, Tensor]:
+            prefix = f"{self.name}.{key}."
+            return {name[len(prefix) :]: tensor for name, tensor in state.items() if name.startswith(prefix)}
+
+        parameters = part("surfels")
+        for name, _ in self.surfels.items():
+            if name not in parameters:
+                raise ValueError(
+                    f"the checkpoint has no {self.name}.surfels.{name}: it was written by another method or version; "
+                    "train again from the start"
+                )
+            setattr(self.surfels, name, parameters[name].clone().requires_grad_())
+        self.optimizer.load(part("adam"))
+        self.density.load(part("density"))
+        self._observation = None

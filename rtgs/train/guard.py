@@ -1,0 +1,116 @@
+"""Stops training at the first non-finite number, and says where it came from."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from rtgs.errors import RtgsError
+
+if TYPE_CHECKING:
+    from rtgs.methods.base import LossTerms, Method
+    from rtgs.methods.surfel_set import SurfelSet
+
+SHOWN = 5
+
+
+@dataclass(frozen=True)
+class BadSurfels:
+    """Surfels with a non-finite gradient or parameter."""
+
+    set_name: str
+    tensor: str  # "gradient of log_scales" or "log_scales"
+    count: int
+    ids: tuple[int, ...]  # the first few
+    values: tuple[str, ...]  # theirs, as text
+
+
+@dataclass(frozen=True)
+class Divergence:
+    """Where training broke."""
+
+    step: int
+    view: str
+    terms: tuple[tuple[str, float], ...]  # every loss term of the step
+    bad_terms: tuple[str, ...]
+    surfels: tuple[BadSurfels, ...]
+
+
+class TrainingDiverged(RtgsError):
+    """A loss or a gradient is not finite. ``divergence`` holds the facts; the last checkpoint is intact."""
+
+    def __init__(self, divergence: Divergence) -> None:
+        self.divergence = divergence
+        lines = [f"training diverged at step {divergence.step}, view {divergence.view!r}"]
+        if divergence.bad_terms:
+            lines.append(f"loss terms that are not finite: {', '.join(divergence.bad_terms)}")
+        lines.append("terms: " + ", ".join(f"{name} {value:.6g}" for name, value in divergence.terms))
+        for bad in divergence.surfels:
+            examples = "; ".join(f"surfel {index}: {value}" for index, value in zip(bad.ids, bad.values, strict=True))
+            lines.append(f"set {bad.set_name}, {bad.tensor}: {bad.count} surfels not finite ({examples})")
+        lines.append(
+            "The last checkpoint is intact and holds finite values. Lower the learning rates in method.optimizer or "
+            "switch the named term off (its weight in method.loss) and run again; if the inputs are ordinary photos, "
+            "please report this message"
+        )
+        super().__init__("\n".join(lines))
+
+
+def check_loss(terms: LossTerms, method: Method, step: int, view: str) -> float:
+    """The loss as a number. One scalar read when all is well.
+
+    Raises:
+        TrainingDiverged: it is not finite.
+    """
+    loss = float(terms.total)
+    if math.isfinite(loss):
+        return loss
+    terms.total.backward()  # for the report alone: its gradients tell which surfels are involved
+    bad = tuple(term.name for term in terms.terms if not bool(torch.isfinite(term.value))) or ("total",)
+    raise TrainingDiverged(Divergence(step, view, _values(terms), bad, _bad_surfels(method)))
+
+
+def check_gradients(terms: LossTerms, method: Method, step: int, view: str) -> None:
+    """Raise :class:`TrainingDiverged` when a gradient is not finite. One sum per parameter when all is well."""
+    if all(_sum_is_finite(tensor.grad) for part in method.sets for _, tensor in part.surfels.items()):
+        return
+    bad = _bad_surfels(method)
+    if bad:  # else a finite sum overflowed: not our business
+        raise TrainingDiverged(Divergence(step, view, _values(terms), (), bad))
+
+
+def _sum_is_finite(tensor: Tensor | None) -> bool:
+    """NaN and inf survive a sum, so a finite sum has only finite parts."""
+    return tensor is None or bool(torch.isfinite(tensor.sum()))
+
+
+def _values(terms: LossTerms) -> tuple[tuple[str, float], ...]:
+    return tuple((term.name, float(term.value)) for term in terms.terms)
+
+
+def _bad_surfels(method: Method) -> tuple[BadSurfels, ...]:
+    """Every parameter and gradient with non-finite rows."""
+    found = []
+    for part in method.sets:
+        for name, tensor in part.surfels.items():
+            for label, values in ((name, tensor.detach()), (f"gradient of {name}", tensor.grad)):
+                bad = _describe(part, label, values)
+                if bad is not None:
+                    found.append(bad)
+    return tuple(found)
+
+
+def _describe(part: SurfelSet, label: str, values: Tensor | None) -> BadSurfels | None:
+    if values is None:
+        return None
+    rows = values.reshape(len(values), -1)
+    ids = (~torch.isfinite(rows).all(dim=1)).nonzero()[:, 0]
+    if len(ids) == 0:
+        return None
+    first = ids[:SHOWN].tolist()
+    texts = tuple(", ".join(f"{value:.4g}" for value in rows[index, :4].tolist()) for index in first)
+    return BadSurfels(part.name, label, len(ids), tuple(first), texts)

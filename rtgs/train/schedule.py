@@ -1,0 +1,94 @@
+"""When things happen: pure functions of the step and the schedule, and the order in which views are visited."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from rtgs.train.settings import ScheduleSettings
+
+
+def check_schedule(schedule: ScheduleSettings) -> None:
+    """Refuse a schedule that cannot run.
+
+    Raises:
+        ValueError: names the key, its value and the legal range.
+    """
+    if schedule.total < 1:
+        raise ValueError(f"schedule.total is {schedule.total}: training needs at least 1 step")
+    for key in ("sh_every", "densify_every", "means_lr_steps", "checkpoint_every"):
+        value = getattr(schedule, key)
+        if value < 1:
+            raise ValueError(f"schedule.{key} is {value}: an interval must be at least 1 step")
+    for key in ("sh_from", "densify_from", "densify_until", "opacity_reset_every", "evaluate_every"):
+        value = getattr(schedule, key)
+        if value < 0:
+            raise ValueError(f"schedule.{key} is {value}: a step cannot be negative (0 switches an interval off)")
+
+
+def sh_degree_at(schedule: ScheduleSettings, step: int, largest: int) -> int:
+    """SH degree in use: 0 until ``sh_from``, then one more every ``sh_every`` steps up to ``largest`` (EnvGS, 3DGS)."""
+    return min(largest, max(0, step - schedule.sh_from) // schedule.sh_every)
+
+
+def densify_due(schedule: ScheduleSettings, step: int) -> bool:
+    """Whether density control runs before ``step``: inside the open window (from, until), every ``densify_every``."""
+    return schedule.densify_from < step < schedule.densify_until and step % schedule.densify_every == 0
+
+
+def opacity_reset_due(schedule: ScheduleSettings, step: int) -> bool:
+    """Whether opacities are reset before ``step``: every ``opacity_reset_every``, only while densifying."""
+    every = schedule.opacity_reset_every
+    return every > 0 and 0 < step < schedule.densify_until and step % every == 0
+
+
+def loss_start(share: float, total: int) -> int:
+    """First step of a loss term that starts after ``share`` of a run of ``total`` steps."""
+    return round(share * total)
+
+
+@dataclass(frozen=True)
+class OrderState:
+    """Everything needed to go on with a :class:`ViewOrder`."""
+
+    permutation: Tensor  # (V,) int64, the current epoch
+    position: int  # views of this epoch already given out
+    generator: Tensor  # uint8 state of the generator
+
+
+class ViewOrder:
+    """One training view per step: every epoch visits all views once, in an order drawn from a dedicated generator."""
+
+    def __init__(self, count: int, seed: int) -> None:
+        if count < 1:
+            raise ValueError("no training view: every image is in the test split, or the scene is empty")
+        self._generator = torch.Generator().manual_seed(seed)
+        self._permutation = torch.randperm(count, generator=self._generator)
+        self._position = 0
+
+    def next(self) -> int:
+        """Index of the next training view."""
+        if self._position == len(self._permutation):
+            self._permutation = torch.randperm(len(self._permutation), generator=self._generator)
+            self._position = 0
+        self._position += 1
+        return int(self._permutation[self._position - 1])
+
+    def state(self) -> OrderState:
+        return OrderState(self._permutation.clone(), self._position, self._generator.get_state())
+
+    def load(self, state: OrderState) -> None:
+        """Go on where ``state`` was taken.
+
+        Raises:
+            ValueError: the state is of another number of views.
+        """
+        if state.permutation.shape != self._permutation.shape:
+            raise ValueError(
+                f"the checkpoint visits {len(state.permutation)} training views, the scene has {len(self._permutation)}"
+            )
+        self._permutation = state.permutation.clone()
+        self._position = state.position
+        self._generator.set_state(state.generator)

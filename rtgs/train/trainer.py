@@ -1,0 +1,271 @@
+"""One training loop for all methods: views, backward pass, checkpoints, progress, metrics. Knows no method by name."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import platform
+import resource
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+import rtgs
+from rtgs.methods.base import Decision, LossTerms, Method, RenderOptions, Stage
+from rtgs.native import core
+from rtgs.scenes.scene import Scene
+from rtgs.train.checkpoint import (
+    Checkpoint,
+    CheckpointRecord,
+    RunSettings,
+    canonical_json,
+    check_resumable,
+    digest,
+    load_newest,
+    save_checkpoint,
+)
+from rtgs.train.guard import check_gradients, check_loss
+from rtgs.train.progress import Progress, SilentProgress, StepReport
+from rtgs.train.schedule import OrderState, ViewOrder
+from rtgs.train.seeds import seed_for
+
+REPORT_EVERY = 10  # steps between looks at the PSNR of a training view
+RECORD_EVERY = 50  # steps between batches of metrics
+AVERAGE_DECAY = 0.95  # of the running averages, per look
+
+
+class Recorder(Protocol):
+    """Where metrics go: any tracker of ``rtgs.track``."""
+
+    def metrics(self, values: Mapping[str, float], step: int) -> None: ...
+
+
+@dataclass(frozen=True)
+class TrainSummary:
+    """What a run of the trainer did."""
+
+    steps: int  # done in all, resumed ones included
+    seconds: float  # training time in all, resumed ones included
+    seconds_per_step: float  # of this process
+    peak_memory_mb: float  # largest resident set of this process
+    surfels: int  # in all sets
+    loss: float  # running average at the end
+    psnr_train: float  # running average at the end, dB
+    psnr_test: float | None  # mean over the test views, dB; None where the scene has none
+    resumed_from: int | None  # step of the checkpoint this process went on from
+    decisions: tuple[Decision, ...]
+
+
+@dataclass
+class RunningAverages:
+    """Exponential averages of what the user watches."""
+
+    loss: float | None = None
+    psnr: float | None = None
+
+    def add_loss(self, value: float) -> None:
+        self.loss = value if self.loss is None else AVERAGE_DECAY * self.loss + (1 - AVERAGE_DECAY) * value
+
+    def add_psnr(self, value: float) -> None:
+        self.psnr = value if self.psnr is None else AVERAGE_DECAY * self.psnr + (1 - AVERAGE_DECAY) * value
+
+
+class Trainer:
+    """Trains one stage of a method on a scene.
+
+    With ``checkpoint_dir``, checkpoints go there and a run finds its way on from the newest of them, bit for bit as if
+    it had not been interrupted (equal settings, scene, thread count, instruction set). The state at the end of the
+    stage is the last checkpoint.
+    """
+
+    def __init__(
+        self,
+        method: Method,
+        scene: Scene,
+        *,
+        seed: int,
+        stage: Stage | None = None,
+        progress: Progress | None = None,
+        recorder: Recorder | None = None,
+        checkpoint_dir: Path | None = None,
+    ) -> None:
+        self.method = method
+        self.scene = scene
+        self.schedule = method.schedule
+        self.stage = stage or method.stages[0]
+        self.progress = progress or SilentProgress()
+        self.recorder = recorder
+        self.checkpoint_dir = checkpoint_dir
+        self._order = ViewOrder(len(scene.train), seed_for(seed, "views"))
+        self._averages = RunningAverages()
+        self._step = self.stage.from_step
+        self._elapsed_before = 0.0
+        self._began = time.monotonic()
+        self._window: list[LossTerms] = []
+        self._settings = canonical_json(RunSettings(method.settings, method.schedule, seed))
+        self._scene_digest = scene_digest(scene)
+
+    def run(self) -> TrainSummary:
+        """Train until the end of the stage.
+
+        Raises:
+            TrainingDiverged: a loss or gradient is not finite; the last checkpoint is intact.
+            CheckpointError: ``checkpoint_dir`` holds checkpoints that cannot be used.
+        """
+        resumed_from = self._resume()
+        first = self._step
+        self._began = time.monotonic()
+        self.progress.start(self.stage.name, first, self.stage.until)
+        try:
+            self._announce(resumed_from)
+            while self._step < self.stage.until:
+                self._train_step()
+                self._between_steps()
+        finally:
+            self._flush_metrics()
+            self.progress.close()
+        seconds = time.monotonic() - self._began
+        return TrainSummary(
+            steps=self._step,
+            seconds=self._elapsed_before + seconds,
+            seconds_per_step=seconds / max(self._step - first, 1),
+            peak_memory_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+            surfels=self._surfels(),
+            loss=self._averages.loss if self._averages.loss is not None else math.nan,
+            psnr_train=self._averages.psnr if self._averages.psnr is not None else math.nan,
+            psnr_test=self.evaluate() if self.scene.test else None,
+            resumed_from=resumed_from,
+            decisions=self.method.decisions,
+        )
+
+    def evaluate(self) -> float:
+        """Mean PSNR over the test views at the present step, images clamped to [0, 1]."""
+        with torch.no_grad():
+            values = [
+                _psnr(self.method.render(view.camera, self._step, RenderOptions()).image, view.image)
+                for view in self.scene.test
+            ]
+        return sum(values) / len(values)
+
+    def checkpoint(self) -> Checkpoint:
+        """The present state as a checkpoint."""
+        order = self._order.state()
+        tensors = {f"method.{name}": tensor for name, tensor in self.method.state().items()}
+        tensors["views.permutation"] = order.permutation
+        tensors["views.generator"] = order.generator
+        return Checkpoint(self._record(order.position), tensors)
+
+    def _train_step(self) -> None:
+        """Render, loss, backward, Adam, density control: one step on one view."""
+        step = self._step
+        view = self.scene.train[self._order.next()]
+        rendered = self.method.render(view.camera, step)
+        terms = self.method.losses(rendered, view, step)
+        loss = check_loss(terms, self.method, step, view.name)
+        terms.total.backward()
+        check_gradients(terms, self.method, step, view.name)
+        for event in self.method.after_step(step):
+            self.progress.note(f"step {step + 1}: {event.set_name}: {event.detail}")
+        self._averages.add_loss(loss)
+        if step % REPORT_EVERY == 0:
+            self._averages.add_psnr(_psnr(rendered.image.detach(), view.image))
+        self._window.append(LossTerms(terms.total.detach(), terms.terms))
+        self._step = step + 1
+
+    def _between_steps(self) -> None:
+        """What happens every so many steps: progress, metrics, evaluation, checkpoint."""
+        step, last = self._step, self._step == self.stage.until
+        if step % REPORT_EVERY == 0 or last:
+            self.progress.advance(self._report())
+        if step % RECORD_EVERY == 0:
+            self._flush_metrics()
+        every = self.schedule.evaluate_every
+        if every and step % every == 0 and self.scene.test:
+            psnr = self.evaluate()
+            self.progress.note(f"step {step}: {psnr:.2f} dB on {len(self.scene.test)} test views")
+            if self.recorder is not None:
+                self.recorder.metrics({"test/psnr": psnr}, step)
+        if self.checkpoint_dir is not None and (step % self.schedule.checkpoint_every == 0 or last):
+            save_checkpoint(self.checkpoint_dir, self.checkpoint())
+
+    def _flush_metrics(self) -> None:
+        """Mean of every loss term since the last flush, and where training stands, to the recorder."""
+        window, self._window = self._window, []
+        if self.recorder is None or not window:
+            return
+        values = {"train/loss": float(torch.stack([terms.total for terms in window]).mean())}
+        for name in dict.fromkeys(term.name for terms in window for term in terms.terms):
+            found = [term.value for terms in window for term in terms.terms if term.name == name]
+            values[f"train/{name}"] = float(torch.stack(found).mean())
+        values["train/psnr"] = self._averages.psnr or 0.0
+        for part in self.method.sets:
+            values[f"surfels/{part.name}"] = float(len(part))
+        self.recorder.metrics(values, self._step)
+
+    def _announce(self, resumed_from: int | None) -> None:
+        if resumed_from is not None:
+            self.progress.note(f"resumed from the checkpoint of step {resumed_from}")
+            return
+        for decision in self.method.decisions:
+            self.progress.note(f"{decision.what}: {decision.why}")
+
+    def _resume(self) -> int | None:
+        """Load the newest checkpoint, if there is one, and return its step."""
+        if self.checkpoint_dir is None:
+            return None
+        checkpoint = load_newest(self.checkpoint_dir, warn=self.progress.note)
+        if checkpoint is None:
+            return None
+        record, tensors = checkpoint.record, checkpoint.tensors
+        check_resumable(record, self._record(0), warn=self.progress.note)
+        prefix = "method."
+        self.method.load({name[len(prefix) :]: t for name, t in tensors.items() if name.startswith(prefix)})
+        self._order.load(OrderState(tensors["views.permutation"], record.order_position, tensors["views.generator"]))
+        self._averages = RunningAverages(record.loss_average, record.psnr_average)
+        self._step = record.step
+        self._elapsed_before = record.elapsed
+        return record.step
+
+    def _record(self, order_position: int) -> CheckpointRecord:
+        return CheckpointRecord(
+            step=self._step,
+            settings_digest=digest(self._settings),
+            scene_digest=self._scene_digest,
+            threads=torch.get_num_threads(),
+            isa=core.isa(),
+            versions=(("rtgs", rtgs.__version__), ("torch", torch.__version__), ("python", platform.python_version())),
+            elapsed=self._elapsed_before + time.monotonic() - self._began,
+            loss_average=self._averages.loss,
+            psnr_average=self._averages.psnr,
+            order_position=order_position,
+            settings=self._settings,
+        )
+
+    def _surfels(self) -> int:
+        return sum(len(part) for part in self.method.sets)
+
+    def _report(self) -> StepReport:
+        return StepReport(self._step, self._averages.loss or 0.0, self._averages.psnr or 0.0, self._surfels())
+
+
+def scene_digest(scene: Scene) -> str:
+    """Digest of what training sees of a scene: cameras, points, and a sample of every image."""
+    sha = hashlib.sha256()
+    for view in (*scene.train, *scene.test):
+        camera = view.camera
+        sha.update(repr((view.name, camera.fx, camera.fy, camera.cx, camera.cy, *view.image.shape)).encode())
+        for tensor in (camera.rotation, camera.translation, view.image.flatten()[::97]):
+            sha.update(tensor.contiguous().numpy().tobytes())
+    sha.update(scene.points.contiguous().numpy().tobytes())
+    return sha.hexdigest()[:16]
+
+
+def _psnr(image: Tensor, target: Tensor) -> float:
+    """PSNR in dB of an image clamped to [0, 1] (methods.md 9: mse floor 1e-10)."""
+    mse = float((image.clamp(0, 1) - target).square_().mean())
+    return -10 * math.log10(max(mse, 1e-10))
