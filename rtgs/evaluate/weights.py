@@ -1,0 +1,161 @@
+"""Pretrained files: what they are called, where they are looked for, how they are verified. Nothing is downloaded.
+
+``rtgs weights`` prints :func:`weights_report`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+
+class MissingWeights(FileNotFoundError):
+    """A pretrained file is not on this machine. The message names the places searched and where to get it."""
+
+
+class WrongWeights(ValueError):
+    """A pretrained file is there but is not the expected one."""
+
+
+@dataclass(frozen=True)
+class PretrainedFile:
+    """One pretrained file this project can use."""
+
+    name: str  # key in the registry
+    filename: str  # relative to a weights folder
+    sha256: str  # of the whole file
+    megabytes: float
+    licence: str
+    source: str  # a page to read, in words; never fetched by the program
+    used_for: str
+
+
+VGG16 = PretrainedFile(
+    name="vgg16",
+    filename="vgg16-397923af.pth",
+    sha256="397923af8e79cdbb6a7127f12361acd7a2f83e06b05044ddf496e83de57a5bf0",
+    megabytes=528.0,
+    licence="torchvision BSD-3-Clause; trained on ImageNet, whose terms are for research",
+    source="torchvision's model page for VGG16_Weights.IMAGENET1K_V1 (download.pytorch.org/models/vgg16-397923af.pth)",
+    used_for="the feature stack of LPIPS",
+)
+LPIPS_VGG = PretrainedFile(
+    name="lpips_vgg",
+    filename="lpips_v0.1/vgg.pth",
+    sha256="a78928a0af1e5f0fcb1f3b9e8f8c3a2a5a3de244d830ad5c1feddc79b8432868",
+    megabytes=0.01,
+    licence="BSD-2-Clause",
+    source="github.com/richzhang/PerceptualSimilarity, lpips/weights/v0.1/vgg.pth",
+    used_for="the linear heads of LPIPS v0.1",
+)
+REGISTRY: dict[str, PretrainedFile] = {file.name: file for file in (VGG16, LPIPS_VGG)}
+
+
+@dataclass(frozen=True)
+class WeightStatus:
+    """What is known of one pretrained file on this machine."""
+
+    file: PretrainedFile
+    path: Path | None
+    problem: str  # empty when the file is there and its SHA-256 agrees
+
+
+def weight_folders() -> tuple[Path, ...]:
+    """Folders searched, first match wins.
+
+    ``RTGS_WEIGHTS``; ``~/.cache/rtgs/weights``; ``weights/`` beside the package; ``$RTGS_SHARED/data/weights`` when
+    ``RTGS_SHARED`` is set; torch's own cache of checkpoints, where torchvision would have put the VGG.
+    """
+    folders: list[Path] = []
+    if os.environ.get("RTGS_WEIGHTS"):
+        folders.append(Path(os.environ["RTGS_WEIGHTS"]).expanduser())
+    folders.append(Path("~/.cache/rtgs/weights").expanduser())
+    folders.append(Path(__file__).resolve().parents[2] / "weights")
+    if os.environ.get("RTGS_SHARED"):
+        folders.append(Path(os.environ["RTGS_SHARED"]).expanduser() / "data" / "weights")
+    folders.append(Path(torch.hub.get_dir()) / "checkpoints")
+    return tuple(folders)
+
+
+def find_weights(file: PretrainedFile, folders: Iterable[Path] | None = None) -> Path:
+    """Path of a pretrained file; its content is not looked at (see :func:`verify_weights`).
+
+    Raises:
+        MissingWeights: in none of the folders.
+    """
+    searched = tuple(weight_folders() if folders is None else folders)
+    for folder in searched:
+        if (folder / file.filename).is_file():
+            return folder / file.filename
+    places = ", ".join(str(folder) for folder in searched)
+    raise MissingWeights(
+        f"weights missing: {file.filename} ({file.megabytes:g} MB, {file.used_for}); searched {places}. "
+        f"Get it from {file.source} (licence: {file.licence}) and put it into one of these folders, "
+        "or point RTGS_WEIGHTS to yours."
+    )
+
+
+def verify_weights(file: PretrainedFile, path: Path) -> None:
+    """Compare the SHA-256 of ``path`` with the registered one.
+
+    Raises:
+        WrongWeights: they differ: another model, or a download cut short.
+    """
+    digest = sha256_of(path)
+    if digest != file.sha256:
+        raise WrongWeights(
+            f"{path} is not {file.filename}: SHA-256 {digest[:16]}..., expected {file.sha256[:16]}... "
+            f"({path.stat().st_size / 2**20:.1f} MB, expected about {file.megabytes:g} MB). "
+            f"Fetch it again from {file.source}"
+        )
+
+
+def sha256_of(path: Path) -> str:
+    """Hexadecimal SHA-256 of a file."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def weights_report(folders: Iterable[Path] | None = None) -> list[WeightStatus]:
+    """One status per registered file; files that are there are verified."""
+    searched = tuple(weight_folders() if folders is None else folders)
+    report = []
+    for file in REGISTRY.values():
+        path = None
+        try:
+            path = find_weights(file, searched)
+            verify_weights(file, path)
+            problem = ""
+        except (MissingWeights, WrongWeights) as error:
+            problem = str(error)
+        report.append(WeightStatus(file, path, problem))
+    return report
+
+
+def read_tensors(path: Path) -> dict[str, Tensor]:
+    """Named tensors of a ``.safetensors`` file or of a ``.pth`` state dict (tensors only, nothing else is unpickled).
+
+    Raises:
+        WrongWeights: not such a file.
+    """
+    if path.suffix == ".safetensors":
+        from safetensors import SafetensorError
+        from safetensors.torch import load_file
+
+        try:
+            return load_file(path)
+        except (SafetensorError, OSError) as error:
+            raise WrongWeights(f"{path} is not a readable safetensors file: {error}") from error
+    try:
+        loaded = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch raises many kinds, from zip errors to pickle errors
+        raise WrongWeights(f"{path} is not a readable checkpoint of tensors: {error}") from error
+    if not isinstance(loaded, dict) or not all(isinstance(value, Tensor) for value in loaded.values()):
+        raise WrongWeights(f"{path} holds {type(loaded).__name__}, expected a dictionary of tensors (a state dict)")
+    return loaded
