@@ -1,0 +1,114 @@
+"""Running a plan in this process, one step after another, each at most once across all processes on the store."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from filelock import Timeout
+
+from rtgs.pipeline.fingerprint import flatten
+from rtgs.pipeline.plan import Plan
+from rtgs.pipeline.step import Step, StepContext, StepFailed
+from rtgs.pipeline.store import Artifact, Store
+from rtgs.track import NullTracking, RunInfo, Tracking
+
+STEPS_EXPERIMENT = "rtgs/steps"
+log = logging.getLogger("rtgs.pipeline")
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """The artifact of one step; ``executed`` when this process made it."""
+
+    step: Step
+    folder: Path
+    duration: float
+    executed: bool
+
+
+class Executor(Protocol):
+    """Runs a plan: :class:`InlineExecutor` here, others behind the same method."""
+
+    def execute(self, plan: Plan) -> tuple[StepResult, ...]:
+        """Bring every step of the plan into the store; results in the plan's order."""
+        ...
+
+
+class InlineExecutor:
+    """Steps in order, in this process; the store's locks keep other processes from doing the same work twice."""
+
+    def __init__(self, store: Store, tracking: Tracking | None = None) -> None:
+        self.store = store
+        self.tracking = tracking or NullTracking()
+
+    def execute(self, plan: Plan) -> tuple[StepResult, ...]:
+        """Bring every step of the plan into the store.
+
+        Raises:
+            StepFailed: a step raised; its message names the step and ``__cause__`` is the step's own exception.
+        """
+        total = len(plan)
+        return tuple(self._ensure(planned.step, f"[{i}/{total}]") for i, planned in enumerate(plan, start=1))
+
+    def _ensure(self, step: Step, position: str) -> StepResult:
+        if artifact := self.store.find(step):
+            log.info("%s %s from the cache", position, step.label)
+            return _result(step, artifact, executed=False)
+        with self._locked(step, position):
+            if artifact := self.store.find(step):
+                log.info("%s %s was made by another process", position, step.label)
+                return _result(step, artifact, executed=False)
+            log.info("%s %s", position, step.label)
+            artifact = self._run(step)
+            log.info("%s %s done in %.1f s", position, step.label, artifact.manifest.duration)
+            return _result(step, artifact, executed=True)
+
+    @contextmanager
+    def _locked(self, step: Step, position: str) -> Iterator[None]:
+        lock = self.store.lock(step)
+        try:
+            lock.acquire(timeout=0)
+        except Timeout:
+            log.info("%s %s: waiting for another process that is at work on it", position, step.label)
+            lock.acquire()
+        try:
+            yield
+        finally:
+            lock.release()
+
+    def _run(self, step: Step) -> Artifact:
+        """Execute under the lock. A failed attempt leaves nothing but its checkpoints."""
+        self.store.discard_attempts(step)
+        attempt, partial = self.store.new_attempt(step), self.store.partial(step)
+        partial.mkdir(parents=True, exist_ok=True)
+        inputs = {other.name: self.store.folder(other) for other in step.upstream}
+        tags = {f"rtgs.upstream.{other.name}": other.fingerprint for other in step.upstream}
+        info = RunInfo(STEPS_EXPERIMENT, step.label, step.fingerprint, {"rtgs.step": step.name, **tags})
+        start = time.perf_counter()
+        try:
+            with self.tracking.run(info) as tracker:
+                tracker.params({key: _scalar(value) for key, value in flatten(step.recipe).items()})
+                context = StepContext(inputs, attempt, partial, logging.getLogger(f"rtgs.{step.name}"), tracker)
+                step.run(step.params, context)
+                return self.store.publish(step, attempt, time.perf_counter() - start)
+        except Exception as error:
+            raise StepFailed(step, error) from error
+        finally:
+            shutil.rmtree(attempt, ignore_errors=True)
+            if partial.exists() and not any(partial.iterdir()):
+                partial.rmdir()
+
+
+def _scalar(value: object) -> str | int | float | bool | None:
+    return value if value is None or isinstance(value, (str, int, float, bool)) else str(value)
+
+
+def _result(step: Step, artifact: Artifact, *, executed: bool) -> StepResult:
+    return StepResult(step, artifact.folder, artifact.manifest.duration, executed)

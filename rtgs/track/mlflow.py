@@ -1,0 +1,189 @@
+"""Tracking into MLflow: a SQLite database and an artifact folder beside it, or a server.
+
+Only the client interface with explicit run ids is used, so an ``MLFLOW_RUN_ID`` in the environment is neither resumed
+nor ended (platform.md B), and threads and processes do not share an active run.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from filelock import FileLock, Timeout
+
+from rtgs.errors import RtgsError
+from rtgs.track.protocol import RunInfo, Scalar, Tracker, as_uint8
+
+if TYPE_CHECKING:
+    from mlflow.tracking import MlflowClient
+
+FINGERPRINT_TAG = "rtgs.fingerprint"
+_FLUSH_CALLS = 50  # calls of metrics() between two writes
+_FLUSH_SECONDS = 30.0
+_BATCH_METRICS, _BATCH_PARAMS, _VALUE_LENGTH = 1000, 100, 6000  # limits of MLflow's log_batch
+
+
+class MlflowTracker:
+    """One MLflow run. Metrics are sent in batches."""
+
+    def __init__(self, client: MlflowClient, run_id: str) -> None:
+        self.client = client
+        self.run_id = run_id
+        self._metrics: list[Any] = []
+        self._calls = 0
+        self._written = time.monotonic()
+
+    def params(self, values: Mapping[str, Scalar]) -> None:
+        """MLflow parameters (strings of at most 6,000 characters)."""
+        from mlflow.entities import Param
+
+        entities = [Param(key, str(value)[:_VALUE_LENGTH]) for key, value in values.items()]
+        for start in range(0, len(entities), _BATCH_PARAMS):
+            self.client.log_batch(self.run_id, params=entities[start : start + _BATCH_PARAMS])
+
+    def metrics(self, values: Mapping[str, float], step: int | None = None) -> None:
+        """Buffered; written every 50 calls or 30 seconds, and at the end. Values that are not finite are dropped."""
+        from mlflow.entities import Metric
+
+        now = int(time.time() * 1000)
+        self._metrics += [Metric(k, float(v), now, step or 0) for k, v in values.items() if np.isfinite(v)]
+        self._calls += 1
+        if self._calls >= _FLUSH_CALLS or time.monotonic() - self._written > _FLUSH_SECONDS:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write the buffered metrics."""
+        pending, self._metrics = self._metrics, []
+        self._calls, self._written = 0, time.monotonic()
+        for start in range(0, len(pending), _BATCH_METRICS):
+            self.client.log_batch(self.run_id, metrics=pending[start : start + _BATCH_METRICS])
+
+    def table(self, name: str, rows: Sequence[Mapping[str, Scalar]]) -> None:
+        """``tables/<name>.json``, shown as a table."""
+        if rows:
+            columns = {key: [row.get(key) for row in rows] for key in rows[0]}
+            self.client.log_table(self.run_id, columns, f"tables/{name}.json")
+
+    def image(self, name: str, array: np.ndarray, step: int | None = None) -> None:
+        """With a step: one stop of the slider of ``name``; without: ``images/<name>.png``."""
+        if step is None:
+            self.client.log_image(self.run_id, as_uint8(array), artifact_file=f"images/{name}.png")
+        else:
+            self.client.log_image(self.run_id, as_uint8(array), key=name, step=step)
+
+    def artifact(self, path: Path) -> None:
+        """A file, or a folder under its own name."""
+        if path.is_dir():
+            self.client.log_artifacts(self.run_id, str(path), artifact_path=path.name)
+        else:
+            self.client.log_artifact(self.run_id, str(path))
+
+
+class MlflowTracking:
+    """Runs in ``sqlite:///<root>/mlflow.db`` with artifacts in ``<root>/mlruns``, or at ``uri``."""
+
+    def __init__(self, root: Path, uri: str = "") -> None:
+        self.root = root.absolute()
+        self.root.mkdir(parents=True, exist_ok=True)
+        self.local = not uri
+        self.uri = uri or f"sqlite:///{self.root / 'mlflow.db'}"
+        self._client: MlflowClient | None = None
+
+    @property
+    def client(self) -> MlflowClient:
+        """The client; the first use makes the database, one process at a time.
+
+        Raises:
+            RtgsError: the database or server cannot be reached.
+        """
+        if self._client is None:
+            _quiet()
+            import mlflow
+            from mlflow.tracking import MlflowClient
+
+            client = MlflowClient(tracking_uri=self.uri)
+            try:
+                with FileLock(str(self.root / "mlflow.db.init.lock")):  # two migrations at once kill each other
+                    client.search_experiments(max_results=1)
+            except mlflow.MlflowException as error:
+                raise RtgsError(
+                    f"MLflow at {self.uri} does not answer ({error}); set tracking.uri, or run with tracking=off"
+                ) from error
+            self._client = client
+        return self._client
+
+    @contextmanager
+    def run(self, info: RunInfo) -> Iterator[Tracker]:
+        """A new run, held by a kernel lock for as long as this process lives."""
+        experiment = self._experiment(info.experiment)
+        self._reap(experiment, info.fingerprint)
+        tags = {FINGERPRINT_TAG: info.fingerprint, **info.tags}
+        run_id = self.client.create_run(experiment, run_name=info.name, tags=tags).info.run_id
+        tracker = MlflowTracker(self.client, run_id)
+        status = "FAILED"
+        with self._alive(run_id):
+            try:
+                yield tracker
+                status = "FINISHED"
+            except KeyboardInterrupt:
+                status = "KILLED"
+                raise
+            finally:
+                try:
+                    tracker.flush()
+                finally:
+                    self.client.set_terminated(run_id, status)
+
+    def _experiment(self, name: str) -> str:
+        with FileLock(str(self.root / "mlflow.db.init.lock")):
+            found = self.client.get_experiment_by_name(name)
+            if found is not None and found.lifecycle_stage == "deleted":
+                self.client.restore_experiment(found.experiment_id)
+            if found is not None:
+                return found.experiment_id
+            location = (self.root / "mlruns").as_uri() if self.local else None
+            return self.client.create_experiment(name, artifact_location=location)
+
+    @contextmanager
+    def _alive(self, run_id: str) -> Iterator[None]:
+        lock = self._run_lock(run_id)
+        with lock:
+            yield
+        Path(lock.lock_file).unlink(missing_ok=True)
+
+    def _run_lock(self, run_id: str) -> FileLock:
+        folder = self.root / "mlruns" / ".locks"
+        folder.mkdir(parents=True, exist_ok=True)
+        return FileLock(str(folder / run_id))
+
+    def _reap(self, experiment: str, fingerprint: str) -> None:
+        """Mark runs of this fingerprint that say RUNNING, but whose process is gone, as KILLED."""
+        running = self.client.search_runs(
+            [experiment], f"attributes.status = 'RUNNING' and tags.`{FINGERPRINT_TAG}` = '{fingerprint}'"
+        )
+        for run in running:
+            lock = self._run_lock(run.info.run_id)
+            try:
+                with lock.acquire(timeout=0):
+                    self.client.set_terminated(run.info.run_id, "KILLED")
+            except Timeout:
+                continue
+            Path(lock.lock_file).unlink(missing_ok=True)
+
+
+def _quiet() -> None:
+    """No telemetry, no network, no migration chatter; set before the first import of MLflow."""
+    os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
+    os.environ.setdefault("DO_NOT_TRACK", "true")
+    os.environ.setdefault("MLFLOW_ENABLE_ASYNC_LOGGING", "false")
+    os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")
+    os.environ.setdefault("MPLCONFIGDIR", os.path.join(tempfile.gettempdir(), "rtgs-matplotlib"))
+    for name in ("alembic", "mlflow"):
+        logging.getLogger(name).setLevel(logging.WARNING)

@@ -1,0 +1,39 @@
+"""Tracking switched off."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from rtgs.track.protocol import RunInfo, Scalar, Tracker
+
+
+class NullTracker:
+    """Accepts everything, keeps nothing."""
+
+    def params(self, values: Mapping[str, Scalar]) -> None:
+        """Nothing is kept."""
+
+    def metrics(self, values: Mapping[str, float], step: int | None = None) -> None:
+        """Nothing is kept."""
+
+    def table(self, name: str, rows: Sequence[Mapping[str, Scalar]]) -> None:
+        """Nothing is kept."""
+
+    def image(self, name: str, array: np.ndarray, step: int | None = None) -> None:
+        """Nothing is kept."""
+
+    def artifact(self, path: Path) -> None:
+        """Nothing is kept."""
+
+
+class NullTracking:
+    """Opens runs that keep nothing."""
+
+    @contextmanager
+    def run(self, info: RunInfo) -> Iterator[Tracker]:
+        """A run that keeps nothing."""
+        yield NullTracker()

@@ -1,0 +1,77 @@
+"""What the rest of the project knows of experiment tracking: five methods, and a way to open a run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+Scalar = str | int | float | bool | None
+
+
+@runtime_checkable
+class Tracker(Protocol):
+    """An open run. Implementations buffer; closing the run (leaving its context) flushes."""
+
+    def params(self, values: Mapping[str, Scalar]) -> None:
+        """Parameters, once, with dotted names (``loss.normal``)."""
+        ...
+
+    def metrics(self, values: Mapping[str, float], step: int | None = None) -> None:
+        """Numbers at an iteration; ``step=None`` for a final value."""
+        ...
+
+    def table(self, name: str, rows: Sequence[Mapping[str, Scalar]]) -> None:
+        """Rows with equal keys, such as one row per test view."""
+        ...
+
+    def image(self, name: str, array: np.ndarray, step: int | None = None) -> None:
+        """(H, W, 3) or (H, W): float in 0..1 or uint8. The same name at several steps makes a slider."""
+        ...
+
+    def artifact(self, path: Path) -> None:
+        """A file or a folder, copied."""
+        ...
+
+
+@dataclass(frozen=True)
+class RunInfo:
+    """What identifies a tracked run.
+
+    ``fingerprint`` is that of the step, or of the last step of a variant; unfinished runs of the same fingerprint whose
+    process is gone are marked as killed when a new one opens.
+    """
+
+    experiment: str
+    name: str
+    fingerprint: str
+    tags: Mapping[str, str] = field(default_factory=dict)
+
+
+class Tracking(Protocol):
+    """Opens runs; one object per process, made by :func:`rtgs.track.open_tracking`."""
+
+    def run(self, info: RunInfo) -> AbstractContextManager[Tracker]:
+        """A new run. Leaving the context normally ends it as finished, by an exception as failed (killed on Ctrl-C)."""
+        ...
+
+
+def as_uint8(array: np.ndarray) -> np.ndarray:
+    """(H, W, 3) or (H, W) picture as uint8; floats are taken as 0..1 and clipped.
+
+    Raises:
+        ValueError: for another shape or dtype.
+    """
+    array = np.asarray(array)
+    if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] != 3) or 0 in array.shape:
+        raise ValueError(f"image has shape {array.shape}; expected (H, W, 3) or (H, W)")
+    if array.dtype == np.uint8:
+        return array
+    if not np.issubdtype(array.dtype, np.floating):
+        raise ValueError(f"image has dtype {array.dtype}; expected floats in 0..1 or uint8")
+    finite = np.nan_to_num(array, nan=0.0, posinf=1.0, neginf=0.0)
+    return (np.clip(finite, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)

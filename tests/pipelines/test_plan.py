@@ -1,0 +1,78 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from toy import ToyParams, graph, train
+
+from rtgs.errors import RtgsError
+from rtgs.pipeline import InlineExecutor, Step, Store, make_plan
+from rtgs.pipeline.plan import topological
+
+
+@pytest.fixture
+def store(tmp_path):
+    store = Store(tmp_path / "store")
+    InlineExecutor(store).execute(make_plan(graph(tmp_path), store))
+    return store
+
+
+def test_upstream_comes_first_and_shared_steps_once(tmp_path):
+    steps = topological(graph(tmp_path) + graph(tmp_path, (0.1, 0.9)))
+    assert [step.name for step in steps] == ["prep", "geom", "train", "train", "train", "train"]
+
+
+def test_everything_is_missing_at_first(tmp_path):
+    plan = make_plan(graph(tmp_path), Store(tmp_path / "empty"))
+    assert (plan.hits, len(plan)) == (0, 5)
+    assert {planned.reason for planned in plan} == {"never ran here"}
+
+
+def test_a_miss_is_explained_by_the_nearest_artifact(tmp_path, store):
+    target = graph(tmp_path, (0.4,))[0]
+    plan = make_plan([target], store)
+    assert [planned.hit for planned in plan] == [True, True, False]
+    assert plan.steps[2].reason in {f"value: {old} -> 0.4" for old in (0.1, 0.2, 0.3)}
+
+
+def test_version_and_upstream_changes_are_named(tmp_path, store):
+    target = graph(tmp_path)[0]
+    bumped = replace(target.upstream[0], version=2)
+    plan = make_plan([replace(target, upstream=(bumped,))], store)
+    assert [planned.reason for planned in plan] == ["", "step version: 1 -> 2", "upstream geom changed"]
+
+
+def test_tools_are_part_of_the_recipe(tmp_path, store):
+    step = graph(tmp_path)[0]
+    newer = Step("train", 1, step.params, train, step.upstream, (("solver", "4.2"),))
+    assert newer.fingerprint != step.fingerprint
+    assert make_plan([newer], store).steps[-1].reason == "solver: absent -> 4.2"
+
+
+def test_a_checkpoint_is_announced(tmp_path, store):
+    step = Step("train", 1, ToyParams(5.0), train, graph(tmp_path)[0].upstream)
+    store.partial(step).mkdir(parents=True)
+    assert make_plan([step], store).steps[-1].reason.endswith("resumes from its checkpoint")
+
+
+def test_an_empty_graph_is_refused(store):
+    with pytest.raises(RtgsError, match="no target"):
+        make_plan([], store)
+
+
+def test_planning_a_thousand_cached_steps_is_quick(tmp_path):
+    import time
+
+    store = Store(tmp_path / "store")
+    steps = [Step("train", 1, ToyParams(float(i)), train) for i in range(1000)]
+    for step in steps:
+        folder = store.folder(step)
+        folder.mkdir(parents=True)
+        (folder / "manifest.json").write_text(
+            f'{{"step": "train", "version": 1, "fingerprint": "{step.fingerprint}", "params": {{"value": 1.0}}, '
+            '"upstream": {}, "tools": {}, "files": {}, "duration": 1.0, "created": "2026-01-01T00:00:00+00:00"}'
+        )
+    start = time.process_time()
+    plan = make_plan(steps, store)
+    assert plan.complete
+    assert time.process_time() - start < 2.0
