@@ -22,7 +22,7 @@ def cameras(viewpoints: Viewpoints, width: int, height: int, seed: int = 0) -> l
     """Jittered cameras on ``rings`` of increasing elevation; neighbours in name order are neighbours in space."""
     rng = np.random.default_rng(seed)
     target = np.asarray(viewpoints.target, float)
-    focal = 0.5 * width / np.tan(np.radians(viewpoints.field_of_view) / 2)
+    focal = float(0.5 * width / np.tan(np.radians(viewpoints.field_of_view) / 2))
     made = []
     for index in range(viewpoints.count):
         turn, ring = divmod(index * viewpoints.rings, viewpoints.count)
