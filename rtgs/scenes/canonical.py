@@ -1,0 +1,124 @@
+"""The cached form of a Scene: ``scene.json`` and one safetensors file per view, an exact float32 round trip."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from rtgs.cameras import Camera
+from rtgs.scenes.scene import Scene, View
+from rtgs.scenes.settings import CaptureError
+
+FORMAT_VERSION = 1
+SCENE_FILE = "scene.json"
+POINTS_FILE = "points.safetensors"
+
+
+@dataclass(frozen=True)
+class _ViewEntry:
+    """A view in scene.json; floats keep all their digits in JSON."""
+
+    name: str
+    file: str
+    camera_name: str
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    rotation: list[list[float]]  # world to camera
+    translation: list[float]
+
+
+def save_scene(scene: Scene, folder: Path) -> None:
+    """Write a scene into ``folder`` (made if missing). ``scene.json`` is written last."""
+    folder = Path(folder)
+    (folder / "views").mkdir(parents=True, exist_ok=True)
+    entries = {"train": [], "test": []}
+    views = [("train", view) for view in scene.train] + [("test", view) for view in scene.test]
+    for index, (part, view) in enumerate(views):
+        file = f"views/{index:05d}.safetensors"
+        tensors = {"image": view.image, "mask": view.mask, "normal": view.normal}
+        save_file({key: t.contiguous() for key, t in tensors.items() if t is not None}, folder / file)
+        entries[part].append(asdict(_entry(view, file)))
+    save_file(
+        {"points": scene.points.contiguous(), "point_colors": scene.point_colors.contiguous()}, folder / POINTS_FILE
+    )
+    content = {
+        "version": FORMAT_VERSION,
+        "name": scene.name,
+        "extent": scene.extent,
+        "source": scene.source,
+        **entries,
+    }
+    (folder / SCENE_FILE).write_text(json.dumps(content, indent=1), encoding="utf-8")
+
+
+def read_scene(folder: Path) -> Scene:
+    """Read what :func:`save_scene` wrote.
+
+    Raises:
+        CaptureError: the folder holds no scene, one of another version, or damaged files.
+    """
+    folder = Path(folder)
+    try:
+        content = json.loads((folder / SCENE_FILE).read_text(encoding="utf-8"))
+        version = content["version"]
+        if version != FORMAT_VERSION:
+            raise CaptureError(
+                f"scene {folder} has format version {version}, this rtgs reads {FORMAT_VERSION}: import again"
+            )
+        cloud = load_file(folder / POINTS_FILE)
+        return Scene(
+            name=content["name"],
+            train=tuple(_view(folder, _ViewEntry(**entry)) for entry in content["train"]),
+            test=tuple(_view(folder, _ViewEntry(**entry)) for entry in content["test"]),
+            points=cloud["points"],
+            point_colors=cloud["point_colors"],
+            extent=content["extent"],
+            source=content["source"],
+        )
+    except (OSError, json.JSONDecodeError, SafetensorError, KeyError, TypeError) as error:
+        raise CaptureError(
+            f"scene {folder} cannot be read ({error}): delete the folder and import the capture again"
+        ) from error
+
+
+def _entry(view: View, file: str) -> _ViewEntry:
+    camera = view.camera
+    return _ViewEntry(
+        name=view.name,
+        file=file,
+        camera_name=camera.name,
+        width=camera.width,
+        height=camera.height,
+        fx=camera.fx,
+        fy=camera.fy,
+        cx=camera.cx,
+        cy=camera.cy,
+        rotation=camera.rotation.tolist(),
+        translation=camera.translation.tolist(),
+    )
+
+
+def _view(folder: Path, entry: _ViewEntry) -> View:
+    tensors: dict[str, Tensor] = load_file(folder / entry.file)
+    camera = Camera(
+        torch.tensor(entry.rotation, dtype=torch.float64),
+        torch.tensor(entry.translation, dtype=torch.float64),
+        entry.fx,
+        entry.fy,
+        entry.cx,
+        entry.cy,
+        entry.width,
+        entry.height,
+        name=entry.camera_name,
+    )
+    return View(camera, tensors["image"], tensors.get("mask"), tensors.get("normal"), entry.name)

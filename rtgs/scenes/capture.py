@@ -1,0 +1,110 @@
+"""What every importer hands over: a capture without pixels. Files are named, not opened, poses are not yet judged."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from rtgs.scenes.settings import CaptureError
+from rtgs.scenes.undistort import Lens
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing ``rtgs check`` has to say about a capture."""
+
+    severity: str  # "error": the capture cannot be trained on; "warning": it can, look at it; "info"
+    what: str  # what is wrong, with the value
+    where: str  # the file, folder or image name
+    what_to_do: str = ""
+
+    @property
+    def message(self) -> str:
+        """One line: what, where, and what to do."""
+        return f"{self.what} [{self.where}]" + (f": {self.what_to_do}" if self.what_to_do else "")
+
+
+@dataclass(frozen=True)
+class CaptureView:
+    """One photo with its pose. ``rotation`` (3, 3) and ``translation`` (3,), float64, map world to camera
+    (x right, y down, z forward); they may hold NaN until checked."""
+
+    name: str  # as the capture names it; the key of name order and of split files
+    image: Path
+    rotation: np.ndarray
+    translation: np.ndarray
+    lens: Lens | None  # None: neither the capture nor a readable photo tells the image size
+    mask: Path | None = None
+    normal: Path | None = None
+
+    @property
+    def center(self) -> np.ndarray:
+        """(3,) camera centre in the world frame."""
+        return -self.rotation.T @ self.translation
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """Points (P, 3) float64 in the world frame, colours (P, 3) float64 in 0..1."""
+
+    positions: np.ndarray
+    colors: np.ndarray
+    source: str = ""  # file or rule they come from
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    def select(self, keep: np.ndarray) -> PointCloud:
+        """The points of a boolean mask or an index."""
+        return PointCloud(self.positions[keep], self.colors[keep], self.source)
+
+
+@dataclass(frozen=True)
+class Capture:
+    """A capture as its files describe it."""
+
+    format: str
+    root: Path
+    views: tuple[CaptureView, ...]  # sorted by name
+    points: PointCloud | None  # None: this format carries no points
+    model_files: tuple[Path, ...]  # the files poses and points were read from
+    split: dict[str, str] = field(default_factory=dict)  # the format's own: name -> "train" | "test" | "unused"
+    random_box: float | None = None  # the format's half side of a cube around the origin for random points
+    findings: tuple[Finding, ...] = ()  # what the importer noticed and did not stop at
+
+
+def existing_side_file(folder: Path, image_name: str, suffixes: Sequence[str]) -> Path | None:
+    """The mask or normal file of an image: ``<image name><suffix>``, ``<image stem><suffix>`` in that order, with the
+    sub-folders of the image name and, failing that, without."""
+    relative = Path(image_name)
+    for base in dict.fromkeys((relative, Path(relative.name))):
+        for suffix in suffixes:
+            for candidate in (folder / f"{base}{suffix}", folder / base.with_suffix(suffix)):
+                if candidate.is_file():
+                    return candidate
+    return None
+
+
+def list_some(items: Iterable[object], limit: int = 20) -> str:
+    """A comma-separated list for messages; the tail is counted."""
+    items = [str(item) for item in items]
+    tail = f", and {len(items) - limit} more" if len(items) > limit else ""
+    return ", ".join(items[:limit]) + tail
+
+
+def raise_errors(findings: Iterable[Finding], root: Path) -> None:
+    """Raise one CaptureError that lists every finding of severity ``error``.
+
+    Raises:
+        CaptureError: at least one of the findings is an error.
+    """
+    errors = [finding for finding in findings if finding.severity == "error"]
+    if not errors:
+        return
+    if len(errors) == 1:
+        raise CaptureError(f"capture {root}: {errors[0].message}")
+    lines = "\n".join(f"  - {finding.message}" for finding in errors)
+    raise CaptureError(f"capture {root}: {len(errors)} problems\n{lines}")

@@ -1,0 +1,208 @@
+"""Photos, masks and normal maps from disk to float32 arrays: Pillow reads, OpenCV averages, nothing is skipped."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageOps
+
+from rtgs.scenes.settings import CaptureError, SceneSettings
+
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
+MASK_SUFFIXES = (".png", ".PNG", ".jpg", ".JPG")
+NORMAL_SUFFIXES = (".png", ".npy")
+_ORIENTATION_TAG = 0x0112
+_SWAPPING_ORIENTATIONS = (5, 6, 7, 8)
+_READ_ERRORS = (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError)
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height in pixels as stored (EXIF orientation not applied), from the header alone.
+
+    Raises:
+        CaptureError: the file is missing, empty or no image.
+    """
+    with _open(path) as picture:
+        return picture.size
+
+
+def read_photo(
+    path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.0), expected: tuple[int, int] | None = None
+) -> np.ndarray:
+    """Read a photo as (H, W, 3) float32 in 0..1, sRGB encoding untouched.
+
+    8 and 16 bit, grey, palette and CMYK are converted; an alpha channel (straight) is composited on ``background``.
+    ``expected`` is the camera's (width, height). Poses refer to pixels as stored, so EXIF orientation is *not* applied,
+    except where only the turned photo has the camera's aspect ratio (tools that turn photos before matching).
+
+    Raises:
+        CaptureError: missing, truncated, zero-sized or unreadable file, or samples outside 0..1 in a float image.
+    """
+    with _open(path) as picture:
+        try:
+            picture.load()
+            picture = _turned_if_needed(picture, expected)
+            pixels = _to_float(picture, path)
+        except _READ_ERRORS as error:
+            raise _unreadable(path, error) from error
+    if pixels.shape[2] == 4:
+        alpha = pixels[..., 3:]
+        pixels = pixels[..., :3] * alpha + np.asarray(background, dtype=np.float32) * (1 - alpha)
+    return np.ascontiguousarray(pixels)
+
+
+def has_alpha(path: Path) -> bool:
+    """True when the image carries an alpha channel or a transparent palette entry."""
+    with _open(path) as picture:
+        return picture.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in picture.info
+
+
+def read_mask(path: Path) -> np.ndarray:
+    """Read a mask as (H, W) bool: True where any colour channel is non-zero and alpha, if any, is not zero.
+
+    Raises:
+        CaptureError: as :func:`read_photo`.
+    """
+    with _open(path) as picture:
+        try:
+            picture.load()
+            if picture.mode == "P" and "transparency" not in picture.info:
+                picture = picture.convert("RGB")
+            pixels = _to_float(picture, path)
+        except _READ_ERRORS as error:
+            raise _unreadable(path, error) from error
+    mask = (pixels[..., :3] > 0).any(-1)
+    return mask & (pixels[..., 3] > 0) if pixels.shape[2] == 4 else mask
+
+
+def read_normals(path: Path, frame: str = "opencv") -> np.ndarray:
+    """Read a normal map as (H, W, 3) float32 unit vectors in the camera frame (x right, y down, z forward).
+
+    ``.png`` holds (n + 1) / 2, ``.npy`` the vectors, (H, W, 3) or (3, H, W). Vectors shorter than 0.5 mean "unknown"
+    and become zero. ``frame`` "opengl" turns y and z of files with x right, y up, z backward.
+
+    Raises:
+        CaptureError: unreadable file, wrong shape, NaN.
+    """
+    normals = _read_normal_array(path) if path.suffix.lower() == ".npy" else 2 * read_photo(path) - 1
+    if frame == "opengl":
+        normals = normals * np.asarray([1, -1, -1], dtype=np.float32)
+    return unit_or_zero(normals)
+
+
+def _read_normal_array(path: Path) -> np.ndarray:
+    try:
+        normals = np.load(path, allow_pickle=False)
+    except _READ_ERRORS as error:
+        raise _unreadable(path, error) from error
+    if normals.ndim == 3 and normals.shape[0] == 3 and normals.shape[2] != 3:
+        normals = np.moveaxis(normals, 0, -1)
+    if normals.ndim != 3 or normals.shape[2] != 3 or not np.issubdtype(normals.dtype, np.floating):
+        raise CaptureError(
+            f"normal map {path} has shape {normals.shape} and type {normals.dtype}: "
+            "store floats of shape (H, W, 3) or (3, H, W)"
+        )
+    if not np.isfinite(normals).all():
+        raise CaptureError(f"normal map {path} holds NaN or inf: write zero vectors where the normal is unknown")
+    return normals.astype(np.float32)
+
+
+def unit_or_zero(vectors: np.ndarray) -> np.ndarray:
+    """Normalise (H, W, 3) vectors; those shorter than 0.5 (unknown, or an average over an edge) become zero."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.where(length > 0.5, vectors / np.maximum(length, 1e-6), 0).astype(np.float32)
+
+
+def target_size(width: int, height: int, settings: SceneSettings) -> tuple[int, int]:
+    """Size a view is shrunk to: ``long_side`` (rounded) or ``resize_ratio`` (truncated); never larger than it was."""
+    if settings.resize_ratio is not None:
+        return max(1, int(width * settings.resize_ratio)), max(1, int(height * settings.resize_ratio))
+    longest = max(width, height)
+    if settings.long_side is None or settings.long_side >= longest:
+        return width, height
+    scale = settings.long_side / longest
+    return max(1, math.floor(width * scale + 0.5)), max(1, math.floor(height * scale + 0.5))
+
+
+def area_resize(image: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Shrink a float32 image (H, W, C) by area averaging; pixel edges are kept."""
+    if image.shape[:2] == (height, width):
+        return image
+    import cv2
+
+    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+
+
+def nearest_resize(image: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Resize (H, W) by taking the pixel that holds each new pixel's centre."""
+    if image.shape[:2] == (height, width):
+        return image
+    row = np.floor((np.arange(height) + 0.5) * image.shape[0] / height).astype(np.intp)
+    column = np.floor((np.arange(width) + 0.5) * image.shape[1] / width).astype(np.intp)
+    return image[row[:, None], column[None, :]]
+
+
+def same_aspect(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """True when two (width, height) differ by scale and at most one pixel of rounding."""
+    scale = (size[0] / other[0] + size[1] / other[1]) / 2
+    return all(abs(a - scale * b) <= max(1.0, scale) for a, b in zip(size, other))
+
+
+def _open(path: Path) -> Image.Image:
+    if not path.is_file():
+        raise CaptureError(f"image {path} does not exist: restore the file or correct images_dir")
+    if path.stat().st_size == 0:
+        raise CaptureError(f"image {path} is an empty file (0 bytes): copy it again or remove it from the capture")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # photos of 100 megapixels are ordinary
+            picture = Image.open(path)
+    except _READ_ERRORS as error:
+        raise _unreadable(path, error) from error
+    if min(picture.size) < 1:
+        raise CaptureError(f"image {path} has zero size {picture.size[0]}x{picture.size[1]}: write it again")
+    return picture
+
+
+def _unreadable(path: Path, error: Exception) -> CaptureError:
+    if isinstance(error, CaptureError):
+        return error
+    reason = str(error).replace(str(path), path.name)
+    return CaptureError(
+        f"image {path} cannot be read ({reason}): the file is truncated, has zero size, or is no image; "
+        "copy it again or remove it from the capture"
+    )
+
+
+def _turned_if_needed(picture: Image.Image, expected: tuple[int, int] | None) -> Image.Image:
+    swapping = picture.getexif().get(_ORIENTATION_TAG) in _SWAPPING_ORIENTATIONS
+    if expected is None or not swapping or same_aspect(picture.size, expected):
+        return picture
+    turned_size = (picture.size[1], picture.size[0])
+    return ImageOps.exif_transpose(picture) if same_aspect(turned_size, expected) else picture
+
+
+def _to_float(picture: Image.Image, path: Path) -> np.ndarray:
+    """Any Pillow mode to (H, W, 3 or 4) float32 in 0..1."""
+    if picture.mode.startswith("I;16") or picture.mode == "I":
+        grey = np.asarray(picture).astype(np.float32) / 65535.0  # Pillow opens 16-bit grey PNG as I;16 or I
+        return _checked_range(np.repeat(grey[..., None], 3, axis=2), path)
+    if picture.mode == "F":
+        grey = np.asarray(picture, dtype=np.float32)
+        return _checked_range(np.repeat(grey[..., None], 3, axis=2), path)
+    alpha = picture.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in picture.info
+    pixels = np.asarray(picture.convert("RGBA" if alpha else "RGB"))
+    return pixels.astype(np.float32) / np.float32(255.0)
+
+
+def _checked_range(pixels: np.ndarray, path: Path) -> np.ndarray:
+    low, high = float(pixels.min()), float(pixels.max())
+    if not (low >= 0 and high <= 1):
+        raise CaptureError(
+            f"image {path} holds values from {low:g} to {high:g}: only images of 8 or 16 bits, or floats in 0..1, "
+            "can be photos; tone-map it first"
+        )
+    return pixels

@@ -1,0 +1,108 @@
+"""Where a capture lies and how it becomes a Scene: the schema of the ``scene`` config group, a frozen dataclass."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from dataclasses import dataclass
+
+FORMATS = ("auto", "colmap", "transforms", "blender")
+POINT_SOURCES = ("auto", "random")
+NORMAL_FRAMES = ("opencv", "opengl")
+
+
+class CaptureError(ValueError):
+    """A capture that cannot be read. The message says what is wrong, where, and what to do about it."""
+
+
+@dataclass(frozen=True)
+class SceneSettings:
+    """Import settings of one capture. Every relative path is relative to ``path``.
+
+    Raises:
+        CaptureError: a value outside its documented range (a misspelt format, a negative size).
+    """
+
+    name: str = "scene"
+    """Name of the scene in tables, folders and logs."""
+    path: str = ""
+    """Folder of the capture, or ``embedded:<name>`` for a capture shipped with rtgs."""
+    format: str = "auto"
+    """``colmap``, ``transforms`` (nerfstudio), ``blender`` (synthetic), or ``auto``: the first of the three found."""
+    long_side: int | None = None
+    """Long side of the views in pixels, reached by area averaging; never enlarged. None: the photo's own size."""
+    resize_ratio: float | None = None
+    """Instead of ``long_side``: a factor in (0, 1] on width and height, truncated by int() as EnvGS does
+    (methods.md 8.1: 0.25 for Ref-Real)."""
+    split_every: int = 8
+    """Views whose index in name order is divisible by it are test views (methods.md 8.1). 0: no test views."""
+    split_file: str | None = None
+    """JSON with lists ``train`` and ``test`` of image names; goes before the format's own split and ``split_every``.
+    Without ``train`` every other view is for training; views in neither list are left out."""
+    images_dir: str | None = None
+    """Folder of the photos (COLMAP). None: ``images``, ``input``, ``rgb``, the largest ``images_<N>``, or ``path``."""
+    model_dir: str | None = None
+    """Folder of the COLMAP model. None: sparse/0, sparse, colmap/sparse/0, colmap/sparse, or ``path``."""
+    masks_dir: str = "masks"
+    """Folder of ``<image stem>.png`` or ``<image name>.png``, non-zero = transparent object (methods.md 7).
+    Empty string: ignore masks."""
+    normals_dir: str = "normals"
+    """Folder of ``<image stem>.png`` (2 rgb - 1) or ``.npy`` ((H, W, 3)) camera-frame normals. Empty string: ignore."""
+    normals_frame: str = "opencv"
+    """Axes of the stored normals: ``opencv`` x right, y down, z forward (rtgs's own) or ``opengl`` x right, y up,
+    z backward."""
+    max_views: int | None = None
+    """At most this many views, spread evenly over name order, chosen before the split. None: all."""
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Colour (0..1) behind images with an alpha channel; use the renderer's background."""
+    points: str = "auto"
+    """``auto``: the capture's points, random ones where the format carries none (Blender, transforms.json without a
+    point file); a COLMAP model without points is refused. ``random``: random points always."""
+    random_points: int = 20_000
+    """How many random points, if random points are drawn."""
+    random_box: float | None = None
+    """Half side of the cube random points fill, in world units. None: 1.3 for Blender (as 3DGS), otherwise the mean
+    distance of the cameras to the point they look at, around which the cube is centred."""
+    min_points: int = 10
+    """A capture with fewer usable points is refused."""
+    min_track_length: int = 0
+    """COLMAP points seen in fewer images are dropped. 0: keep all."""
+    max_point_error: float | None = None
+    """COLMAP points with a larger mean reprojection error in pixels are dropped. None: keep all."""
+    near_camera: float = 1e-2
+    """Points nearer than this times the scene extent to a camera centre are dropped (methods.md 13, 14)."""
+    far_factor: float = 30.0
+    """Points farther from the cameras' mean than this times the 90th percentile of that distance are dropped as
+    mis-triangulated. 0: keep all."""
+    seed: int = 0
+    """Seed of random points."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "background", tuple(float(c) for c in self.background))
+        _check_choice("format", self.format, FORMATS)
+        _check_choice("points", self.points, POINT_SOURCES)
+        _check_choice("normals_frame", self.normals_frame, NORMAL_FRAMES)
+        if len(self.background) != 3 or not all(0 <= c <= 1 for c in self.background):
+            raise CaptureError(f"scene setting background={self.background}: give three numbers between 0 and 1")
+        if self.long_side is not None and self.resize_ratio is not None:
+            raise CaptureError("scene settings long_side and resize_ratio are both given: keep one of them")
+        if self.resize_ratio is not None and not 0 < self.resize_ratio <= 1:
+            raise CaptureError(f"scene setting resize_ratio={self.resize_ratio}: must lie in (0, 1]")
+        for field_name, least in (("long_side", 1), ("max_views", 1), ("max_point_error", 0), ("random_box", 0)):
+            _check_least(field_name, getattr(self, field_name), least)
+        for field_name in ("split_every", "min_points", "min_track_length", "near_camera", "far_factor"):
+            _check_least(field_name, getattr(self, field_name), 0)
+        _check_least("random_points", self.random_points, 1)
+
+
+def _check_choice(field_name: str, value: str, choices: tuple[str, ...]) -> None:
+    if value in choices:
+        return
+    close = difflib.get_close_matches(value, choices, n=1)
+    hint = f"; did you mean {close[0]!r}?" if close else ""
+    raise CaptureError(f"scene setting {field_name}={value!r} is unknown: choose one of {', '.join(choices)}{hint}")
+
+
+def _check_least(field_name: str, value: float | None, least: float) -> None:
+    if value is not None and not (math.isfinite(value) and value >= least):
+        raise CaptureError(f"scene setting {field_name}={value}: must be at least {least}")

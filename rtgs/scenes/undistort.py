@@ -1,0 +1,190 @@
+"""Lenses: every camera model COLMAP knows, used directly when it is a pinhole and undistorted when it is not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from rtgs.scenes.settings import CaptureError
+
+# model -> how many leading parameters are a pinhole's; the rest is distortion that vanishes when it is zero.
+_PINHOLE_PARAMETERS = {
+    "SIMPLE_PINHOLE": 3,
+    "PINHOLE": 4,
+    "SIMPLE_RADIAL": 3,
+    "RADIAL": 3,
+    "OPENCV": 4,
+    "FULL_OPENCV": 4,
+    "SIMPLE_DIVISION": 3,
+    "DIVISION": 4,
+}
+_MAX_OUTSIDE_SHARE = 0.01  # of the undistorted pixels; above it the lens parameters cannot be right
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A camera model in COLMAP's names and parameter order, for images of ``width`` x ``height`` pixels.
+
+    Pixel centres lie at (i + 0.5, j + 0.5), COLMAP's convention.
+    """
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+    @property
+    def is_pinhole(self) -> bool:
+        """True when no resampling is needed: a pinhole model, or one whose distortion is zero."""
+        count = _PINHOLE_PARAMETERS.get(self.model)
+        return count is not None and not any(self.params[count:])
+
+    def pinhole(self) -> Lens:
+        """The PINHOLE lens (fx, fy, cx, cy) of the undistorted image.
+
+        Raises:
+            CaptureError: the lens sees all around (EQUIRECTANGULAR) or cannot be undistorted.
+        """
+        if self.is_pinhole:
+            if _PINHOLE_PARAMETERS[self.model] == 3:
+                focal, cx, cy = self.params[:3]
+                return Lens("PINHOLE", self.width, self.height, (focal, focal, cx, cy))
+            return Lens("PINHOLE", self.width, self.height, self.params[:4])
+        return undistorted_lens(self)
+
+    def resized(self, width: int, height: int) -> Lens:
+        """The lens for the same photo resized to ``width`` x ``height``; pixel edges are kept."""
+        if (width, height) == (self.width, self.height):
+            return self
+        if self.is_pinhole:
+            sx, sy = width / self.width, height / self.height
+            fx, fy, cx, cy = self.pinhole().params
+            return Lens("PINHOLE", width, height, (fx * sx, fy * sy, cx * sx, cy * sy))
+        camera = _colmap_camera(self)
+        camera.rescale(width, height)
+        return replace(self, width=width, height=height, params=tuple(float(p) for p in camera.params))
+
+    def fitted(self, width: int, height: int, name: str) -> Lens:
+        """The lens for an image found on disk, which may be an enlarged or shrunk copy (``images_4``).
+
+        Raises:
+            CaptureError: the aspect ratios differ by more than the rounding of one pixel.
+        """
+        if (width, height) == (self.width, self.height):
+            return self
+        scale = (width / self.width + height / self.height) / 2
+        if abs(width - scale * self.width) > 1 or abs(height - scale * self.height) > 1:
+            raise CaptureError(
+                f"image {name} is {width}x{height} pixels, its camera {self.width}x{self.height}: the aspect ratios "
+                "differ, so the image was cropped, rotated or belongs to another camera; "
+                "use the images the poses were computed from"
+            )
+        return self.resized(width, height)
+
+
+def check_lens(lens: Lens, name: str) -> str | None:
+    """What is wrong with a lens, or None. ``name`` is where it comes from."""
+    if not np.isfinite(lens.params).all():
+        return f"camera of {name}: parameters {lens.params} hold NaN or inf"
+    if lens.width < 1 or lens.height < 1:
+        return f"camera of {name}: image size {lens.width}x{lens.height}"
+    focals = lens.params[: 1 if _PINHOLE_PARAMETERS.get(lens.model) == 3 else 2]
+    if lens.model != "EQUIRECTANGULAR" and min(focals[:1]) <= 0:
+        return f"camera of {name}: focal length {focals[0]} is not positive"
+    try:
+        pinhole = lens.pinhole()
+    except CaptureError as error:
+        return str(error)
+    if min(pinhole.params[:2]) <= 0:
+        return f"camera of {name}: focal lengths {pinhole.params[:2]} must be positive"
+    return None
+
+
+@lru_cache(maxsize=256)
+def undistorted_lens(lens: Lens) -> Lens:
+    """COLMAP's choice of the PINHOLE lens that covers a distorted image without blank pixels.
+
+    Raises:
+        CaptureError: spherical lenses, and parameters COLMAP cannot undistort.
+    """
+    import pycolmap
+
+    camera = _colmap_camera(lens)
+    if lens.model == "EQUIRECTANGULAR":
+        raise CaptureError(
+            "camera model EQUIRECTANGULAR sees all around, no single pinhole image can hold it: cut the panoramas "
+            "into perspective images first (colmap's panorama_sfm example does) and import those"
+        )
+    try:
+        target = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
+    except (RuntimeError, ValueError) as error:
+        raise CaptureError(f"camera {lens.model} {lens.params} cannot be undistorted: {error}") from error
+    params = tuple(float(p) for p in target.params)
+    if target.model_name not in ("PINHOLE", "SIMPLE_PINHOLE") or not np.isfinite(params).all():
+        raise CaptureError(
+            f"camera {lens.model} {lens.params} cannot be undistorted to a pinhole: check its parameters"
+        )
+    return Lens(target.model_name, int(target.width), int(target.height), params).pinhole()
+
+
+@lru_cache(maxsize=2)
+def undistortion_map(lens: Lens) -> np.ndarray:
+    """For each pixel of the undistorted image the place in the distorted one: (H, W, 2) float32, in array index units
+    (pixel centres at integers), as ``cv2.remap`` wants it.
+
+    Raises:
+        CaptureError: more than 1 % of the undistorted pixels fall outside the photo.
+    """
+    target = lens.pinhole()
+    fx, fy, cx, cy = target.params
+    camera = _colmap_camera(lens)
+    x = (np.arange(target.width, dtype=np.float64) + 0.5 - cx) / fx
+    result = np.empty((target.height, target.width, 2), dtype=np.float32)
+    ray = np.ones((target.width, 3))
+    ray[:, 0] = x
+    for row in range(target.height):
+        ray[:, 1] = (row + 0.5 - cy) / fy
+        result[row] = np.asarray(camera.img_from_cam(ray)) - 0.5
+    inside = (result >= -1).all(-1) & (result[..., 0] <= lens.width) & (result[..., 1] <= lens.height)
+    outside_share = 1 - float(inside.mean())
+    if not outside_share <= _MAX_OUTSIDE_SHARE:
+        raise CaptureError(
+            f"camera {lens.model} {lens.params}: {outside_share:.1%} of the undistorted pixels fall outside the "
+            f"{lens.width}x{lens.height} photo; the distortion parameters are not plausible, calibrate again"
+        )
+    return result
+
+
+def undistort_image(image: np.ndarray, lens: Lens) -> np.ndarray:
+    """Resample a float32 photo (H, W, C) to the pinhole of ``lens`` by bilinear interpolation; edge pixels repeat."""
+    if lens.is_pinhole:
+        return image
+    import cv2
+
+    grid = undistortion_map(lens)
+    return cv2.remap(image, grid, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+def undistort_nearest(image: np.ndarray, lens: Lens) -> np.ndarray:
+    """Resample a mask (H, W) to the pinhole of ``lens`` by the nearest pixel."""
+    if lens.is_pinhole:
+        return image
+    grid = undistortion_map(lens)
+    column = np.clip(np.rint(grid[..., 0]), 0, lens.width - 1).astype(np.intp)
+    row = np.clip(np.rint(grid[..., 1]), 0, lens.height - 1).astype(np.intp)
+    return image[row, column]
+
+
+def _colmap_camera(lens: Lens) -> Any:
+    import pycolmap
+
+    try:
+        camera = pycolmap.Camera(model=lens.model, width=lens.width, height=lens.height, params=list(lens.params))
+    except (RuntimeError, ValueError, TypeError) as error:
+        raise CaptureError(f"camera model {lens.model!r} with parameters {lens.params}: {error}") from error
+    if not camera.verify_params():
+        raise CaptureError(f"camera model {lens.model} takes {camera.params_info}, got {len(lens.params)} numbers")
+    return camera
