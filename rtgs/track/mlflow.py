@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import logging
 import os
-import tempfile
 import time
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -105,16 +105,17 @@ class MlflowTracking:
         """
         if self._client is None:
             _quiet()
-            import mlflow
             from mlflow.tracking import MlflowClient
 
-            client = MlflowClient(tracking_uri=self.uri)
+            _quiet_logs()
             try:
                 with FileLock(str(self.root / "mlflow.db.init.lock")):  # two migrations at once kill each other
+                    client = MlflowClient(tracking_uri=self.uri)
                     client.search_experiments(max_results=1)
-            except mlflow.MlflowException as error:
+            except Exception as error:  # of MLflow, SQLAlchemy, SQLite, or the network
                 raise RtgsError(
-                    f"MLflow at {self.uri} does not answer ({error}); set tracking.uri, or run with tracking=off"
+                    f"MLflow at {self.uri} does not answer ({type(error).__name__}: {_first_line(error)}); "
+                    "set tracking.uri, or run with tracking=off"
                 ) from error
             self._client = client
         return self._client
@@ -142,21 +143,24 @@ class MlflowTracking:
                     self.client.set_terminated(run_id, status)
 
     def _experiment(self, name: str) -> str:
+        client = self.client  # initialised before the lock below is taken: it takes the same one
         with FileLock(str(self.root / "mlflow.db.init.lock")):
-            found = self.client.get_experiment_by_name(name)
+            found = client.get_experiment_by_name(name)
             if found is not None and found.lifecycle_stage == "deleted":
-                self.client.restore_experiment(found.experiment_id)
+                client.restore_experiment(found.experiment_id)
             if found is not None:
                 return found.experiment_id
             location = (self.root / "mlruns").as_uri() if self.local else None
-            return self.client.create_experiment(name, artifact_location=location)
+            return client.create_experiment(name, artifact_location=location)
 
     @contextmanager
     def _alive(self, run_id: str) -> Iterator[None]:
         lock = self._run_lock(run_id)
-        with lock:
-            yield
-        Path(lock.lock_file).unlink(missing_ok=True)
+        try:
+            with lock:
+                yield
+        finally:
+            Path(lock.lock_file).unlink(missing_ok=True)
 
     def _run_lock(self, run_id: str) -> FileLock:
         folder = self.root / "mlruns" / ".locks"
@@ -178,12 +182,20 @@ class MlflowTracking:
             Path(lock.lock_file).unlink(missing_ok=True)
 
 
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [""])[0]
+
+
 def _quiet() -> None:
-    """No telemetry, no network, no migration chatter; set before the first import of MLflow."""
+    """No telemetry, no network; set before the first import of MLflow."""
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
     os.environ.setdefault("DO_NOT_TRACK", "true")
-    os.environ.setdefault("MLFLOW_ENABLE_ASYNC_LOGGING", "false")
     os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")
-    os.environ.setdefault("MPLCONFIGDIR", os.path.join(tempfile.gettempdir(), "rtgs-matplotlib"))
-    for name in ("alembic", "mlflow"):
+
+
+def _quiet_logs() -> None:
+    """No migration chatter; MLflow sets up its own logging when it is imported, so this comes after."""
+    for name in ("alembic", "mlflow", "mlflow.store.db.utils"):
         logging.getLogger(name).setLevel(logging.WARNING)
+    warnings.filterwarnings("ignore", category=DeprecationWarning, module="mlflow")
+    warnings.filterwarnings("ignore", message=".*select_dtypes.*", module="mlflow")

@@ -1,0 +1,136 @@
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from test_track import INFO, log_everything
+
+from rtgs.errors import RtgsError
+from rtgs.track import RunInfo, open_tracking
+from rtgs.track.mlflow import MlflowTracking
+
+WRITER = """
+import sys, time
+from pathlib import Path
+from rtgs.track import RunInfo, open_tracking
+root, mode = Path(sys.argv[1]), sys.argv[2]
+with open_tracking("mlflow", root).run(RunInfo("rtgs/steps", "toy", "a" * 64)) as tracker:
+    tracker.metrics({"loss": 1.0}, 1)
+    if mode == "hang":
+        (root / "hanging").touch()
+        time.sleep(600)
+"""
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("mlflow")
+
+
+@pytest.fixture
+def tracking(root) -> MlflowTracking:
+    tracking = open_tracking("mlflow", root)
+    assert isinstance(tracking, MlflowTracking)
+    return tracking
+
+
+def writer(root: Path, mode: str) -> subprocess.Popen:
+    code = [sys.executable, "-c", WRITER, str(root), mode]
+    return subprocess.Popen(code, stderr=subprocess.PIPE, text=True)
+
+
+def runs(tracking: MlflowTracking, experiment: str):
+    found = tracking.client.get_experiment_by_name(experiment)
+    assert found is not None
+    return tracking.client.search_runs([found.experiment_id])
+
+
+def test_four_processes_on_a_cold_database(root):
+    processes = [writer(root, "once") for _ in range(4)]
+    errors = [process.communicate(timeout=120)[1] for process in processes]
+    assert [process.returncode for process in processes] == [0] * 4, errors
+    assert [run.info.status for run in runs(MlflowTracking(root), "rtgs/steps")] == ["FINISHED"] * 4
+
+
+def test_everything_arrives(tracking, root, tmp_path):
+    with tracking.run(INFO) as tracker:
+        log_everything(tracker, tmp_path)
+    (run,) = runs(tracking, "rtgs/test")
+    client, run_id = tracking.client, run.info.run_id
+    assert run.info.status == "FINISHED"
+    assert run.data.params == {"loss.normal": "0.05", "scene": "fox", "split": "None"}
+    assert run.data.tags["rtgs.scene"] == "fox"
+    assert run.data.metrics["eval/psnr"] == 27.5
+    history = client.get_metric_history(run_id, "train/loss")
+    assert [metric.step for metric in history] == list(range(120))
+    files = {path.relative_to(root / "mlruns").as_posix() for path in (root / "mlruns" / run_id).rglob("*.*")}
+    assert f"{run_id}/artifacts/report.html" in files
+    assert f"{run_id}/artifacts/renders/a.txt" in files
+    assert f"{run_id}/artifacts/tables/eval.json" in files
+    assert f"{run_id}/artifacts/images/error.png" in files
+    assert any("eval" in name and name.endswith(".png") for name in files)
+
+
+def test_metrics_survive_an_exception(tracking):
+    def fail() -> None:
+        with tracking.run(INFO) as tracker:
+            tracker.metrics({"loss": 3.0}, 1)
+            raise ValueError("bad")
+
+    with pytest.raises(ValueError, match="bad"):
+        fail()
+    run = runs(tracking, "rtgs/test")[0]
+    assert (run.info.status, run.data.metrics) == ("FAILED", {"loss": 3.0})
+
+
+def test_a_killed_run_is_marked_by_the_next_and_a_live_one_is_not(tracking, root):
+    hanging = writer(root, "hang")
+    end = time.monotonic() + 60
+    while not (root / "hanging").exists():
+        assert hanging.poll() is None
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    info = RunInfo("rtgs/steps", "toy", "a" * 64)
+
+    def unfinished() -> list[str]:
+        with tracking.run(info):
+            pass
+        return [run.info.status for run in runs(tracking, "rtgs/steps") if run.info.status != "FINISHED"]
+
+    assert unfinished() == ["RUNNING"]
+    hanging.send_signal(signal.SIGKILL)
+    hanging.wait(10)
+    assert unfinished() == ["KILLED"]
+    assert not list((root / "mlruns" / ".locks").iterdir())
+
+
+def test_a_run_id_in_the_environment_is_left_alone(tracking, monkeypatch):
+    with tracking.run(INFO):
+        pass
+    parent = runs(tracking, "rtgs/test")[0].info
+    monkeypatch.setenv("MLFLOW_RUN_ID", parent.run_id)
+    with tracking.run(INFO) as tracker:
+        tracker.metrics({"child": 1.0})
+    newest = runs(tracking, "rtgs/test")[0]
+    assert newest.info.run_id != parent.run_id
+    assert newest.data.metrics == {"child": 1.0}
+    after = tracking.client.get_run(parent.run_id)
+    assert (after.info.end_time, after.data.metrics) == (parent.end_time, {})
+
+
+def test_a_database_that_cannot_be_used_says_so(tmp_path):
+    (tmp_path / "mlflow.db").write_text("this is not a database" * 100)
+    with pytest.raises(RtgsError, match=r"does not answer .* tracking=off"), MlflowTracking(tmp_path).run(INFO):
+        pass
+
+
+def test_batches_cost_little(tracking):
+    with tracking.run(INFO) as tracker:
+        start = time.process_time()
+        for step in range(500):
+            tracker.metrics({f"train/{name}": float(step) for name in "abcdef"}, step=step)
+        assert time.process_time() - start < 5.0
