@@ -258,7 +258,7 @@ def ray_plane(surfels: ProjectedSurfels, offset: Tensor) -> tuple[Tensor, Tensor
 
 def transmittance_before(alpha: Tensor) -> Tensor:
     """(P, K + 1): transmittance before each of K surfels, and after the last."""
-    return torch.cat((torch.ones_like(alpha[:, :1]), 1 - alpha), 1).cumprod(1)
+    return torch.cat((alpha.new_ones(len(alpha), 1), 1 - alpha), 1).cumprod(1)
 
 
 @torch.no_grad()
