@@ -1,0 +1,51 @@
+"""Compose a config without running anything: for ``rtgs plan``, ``rtgs check`` and the tests."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from omegaconf import DictConfig
+
+from rtgs.config.convert import to_run_config
+from rtgs.config.locate import conf_dir
+from rtgs.config.schema import Choices, RunConfig, register_schema
+
+VERSION_BASE = "1.3"
+
+
+def compose(overrides: Sequence[str]) -> tuple[RunConfig, Choices]:
+    """The config of ``rtgs run <overrides>``.
+
+    Raises:
+        hydra.errors.HydraException: an override or a file does not fit the schema (its cause names the key).
+        RtgsError: a value is missing.
+    """
+    from hydra import compose as hydra_compose
+    from hydra import initialize_config_dir
+
+    register_schema()
+    with initialize_config_dir(str(conf_dir()), version_base=VERSION_BASE):
+        composed = hydra_compose("config", overrides=list(overrides), return_hydra_config=True)
+    hydra = composed.hydra
+    choices = choices_from(hydra.runtime.choices, hydra.overrides.task)
+    return to_run_config(without_hydra(composed), choices)
+
+
+def without_hydra(composed: DictConfig) -> DictConfig:
+    """The part of a composed config that is ours."""
+    from omegaconf import OmegaConf, open_dict
+
+    own = composed.copy()
+    OmegaConf.set_readonly(own, False)
+    with open_dict(own):
+        own.pop("hydra", None)
+    return own
+
+
+def choices_from(groups: Mapping[str, object], overrides: Sequence[str]) -> Choices:
+    """Hydra's record of chosen files and overrides as :class:`Choices`."""
+    names = {str(key): str(value) for key, value in groups.items() if value is not None}
+    chosen = {key: names.get(key, "") for key in ("scene", "method", "preset", "ablation", "experiment")}
+    groups_set = {*names, "hydra", "paths.root", "name", "threads"}
+    keys = [item for item in overrides if item.split("=", 1)[0].lstrip("+~") not in groups_set]
+    return Choices(**chosen, overrides=tuple(keys))

@@ -1,0 +1,98 @@
+"""From what Hydra composed to frozen dataclasses: done once, so that nothing behind it knows of OmegaConf."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import re
+import types
+import typing
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from rtgs.config.schema import Choices, RunConfig
+from rtgs.errors import RtgsError
+
+_UNTELLING = {"images", "input", "rgb", "sparse", "colmap", "0", "data", "dense", "undistorted"}
+
+
+def to_run_config(composed: DictConfig, choices: Choices) -> tuple[RunConfig, Choices]:
+    """The composed config as dataclasses: interpolations resolved, paths absolute, names derived.
+
+    Raises:
+        RtgsError: a mandatory value is missing or an interpolation fails; names the key.
+    """
+    try:
+        values = OmegaConf.to_container(composed, resolve=True, throw_on_missing=True)
+    except OmegaConfBaseException as error:
+        raise RtgsError(f"config: {error}; set it on the command line or in its YAML file") from error
+    assert isinstance(values, dict)
+    config = build(RunConfig, {str(key): value for key, value in values.items()})
+    scene = config.scene
+    if not scene.path:
+        raise RtgsError(
+            "config: scene.path is empty; choose a scene (scene=fox) or give a folder (scene.path=/my/photos)"
+        )
+    if ":" not in scene.path.split("/")[0]:
+        scene = replace(scene, path=_absolute(scene.path))
+    if not scene.name:
+        scene = replace(scene, name=derive_name(scene.path))
+    choices = replace(choices, scene=scene.name)
+    config = replace(config, scene=scene, paths=replace(config.paths, root=_absolute(config.paths.root)))
+    return replace(config, name=config.name or run_name(choices, config.seed)), choices
+
+
+def _absolute(path: str) -> str:
+    return str(Path(os.path.expandvars(path)).expanduser().absolute().resolve())
+
+
+def build(cls: type, values: Mapping[str, Any]) -> Any:
+    """An instance of the (frozen) dataclass ``cls`` from plain containers."""
+    hints = typing.get_type_hints(cls)
+    unknown = sorted(set(values) - set(hints))
+    if unknown:
+        raise RtgsError(f"config: {cls.__name__} has no key {', '.join(unknown)}; it has {', '.join(hints)}")
+    return cls(
+        **{
+            item.name: _value(hints[item.name], values[item.name])
+            for item in dataclasses.fields(cls)
+            if item.name in values
+        }
+    )
+
+
+def _value(hint: Any, value: Any) -> Any:
+    if value is None:
+        return None
+    if dataclasses.is_dataclass(hint):
+        return build(typing.cast(type, hint), value)
+    if isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union:
+        (inner,) = [part for part in typing.get_args(hint) if part is not type(None)]
+        return _value(inner, value)
+    if typing.get_origin(hint) is tuple:
+        item = typing.get_args(hint)[0]
+        return tuple(_value(item, each) for each in typing.cast(Sequence[Any], value))
+    return value
+
+
+def derive_name(path: str) -> str:
+    """A scene's name from its folder: the last part that tells something, in letters, digits, dash, underscore."""
+    parts = [part for part in Path(path.split(":", 1)[-1]).parts if part not in ("/", ".")]
+    telling = [part for part in parts if part.lower() not in _UNTELLING]
+    name = (telling or parts or ["scene"])[-1]
+    return re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_") or "scene"
+
+
+def run_name(choices: Choices, seed: int) -> str:
+    """Folder name of a run: ``fox-2dgs-quick``, with the ablation and the seed where they are not the default."""
+    parts = [choices.scene, choices.method, choices.preset]
+    if choices.ablation not in ("", "none"):
+        parts.append(choices.ablation)
+    if seed:
+        parts.append(f"seed{seed}")
+    return "-".join(part.replace("/", "_") for part in parts if part)

@@ -1,0 +1,42 @@
+"""Hydra's and OmegaConf's complaints as one message: what, in which file or override, which key, and what to write."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import re
+import typing
+
+from hydra.errors import OverrideParseException
+
+from rtgs.config.schema import RunConfig
+
+
+def explain(error: BaseException) -> str:
+    """One message for a config that does not compose."""
+    if isinstance(error, OverrideParseException):
+        grammar = (str(error).splitlines() or [""])[0]
+        return f"{error.override!r} is not a legal override ({grammar}); put a value with special characters in quotes"
+    cause = error.__cause__
+    first = str(error).splitlines()[0] if str(error) else type(error).__name__
+    text = str(error) if cause is None else f"{first}\n{cause}"
+    text = re.sub(r"\nConfig search path:.*", "", text, flags=re.DOTALL)
+    text = re.sub(r"\n\s*(reference_type|object_type)=.*", "", text)
+    text = re.sub(r"\nTo append to your config use .*", "", text)
+    text = re.sub(r"\n\s*full_key: (\S+)", r" (\1)", text)
+    text = re.sub(r"\n\s*full_key: ?", "", text)
+    match = re.search(r"Key '([^']+)' (?:is )?not in", text)
+    if match:
+        close = difflib.get_close_matches(match.group(1), sorted(all_keys(RunConfig)), n=3)
+        text += f"\nDid you mean {' or '.join(close)}?" if close else "\n`rtgs run --help` lists all keys."
+    return text
+
+
+def all_keys(cls: type) -> set[str]:
+    """Every field name in a dataclass tree."""
+    names: set[str] = set()
+    for name, hint in typing.get_type_hints(cls).items():
+        names.add(name)
+        if dataclasses.is_dataclass(hint):
+            names |= all_keys(typing.cast(type, hint))
+    return names

@@ -1,0 +1,41 @@
+"""Where the YAML files and the files shipped with the project lie: in a checkout as in an installed wheel."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+from rtgs.errors import RtgsError
+
+
+@cache
+def project_root() -> Path:
+    """The folder that holds ``conf/`` and ``pipelines/``.
+
+    Raises:
+        RtgsError: the installation lacks them.
+    """
+    import pipelines
+
+    root = Path(pipelines.__path__[0]).resolve().parent
+    if not (root / "conf" / "config.yaml").is_file():
+        raise RtgsError(f"{root / 'conf' / 'config.yaml'} is missing: install rtgs again")
+    return root
+
+
+def conf_dir() -> Path:
+    """The folder of the YAML files."""
+    return project_root() / "conf"
+
+
+def choices_of(group: str) -> tuple[str, ...]:
+    """Names that can be chosen from a config group."""
+    folder = conf_dir() / group
+    return tuple(sorted(path.relative_to(folder).with_suffix("").as_posix() for path in folder.rglob("*.yaml")))
+
+
+def register_resolvers() -> None:
+    """``${rtgs.root:}`` in YAML: the folder that holds ``conf/`` and the shipped data."""
+    from omegaconf import OmegaConf
+
+    OmegaConf.register_new_resolver("rtgs.root", lambda: str(project_root()), replace=True)

@@ -1,0 +1,149 @@
+"""What a run is made of. These dataclasses are the schema of ``conf/``: a misspelt key or a wrong type stops there."""
+
+from __future__ import annotations
+
+import dataclasses
+import typing
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from rtgs.scenes.settings import SceneSettings
+from rtgs.train.settings import MethodSettings, ScheduleSettings
+
+SCHEMA_NAME = "run_schema"
+
+
+@dataclass(frozen=True)
+class PathsConfig:
+    """Where results go: ``<root>/store`` (cached artifacts), ``<root>/runs`` (results), tracking and logs beside."""
+
+    root: str = "."
+
+    @property
+    def store(self) -> Path:
+        """The artifact store."""
+        return Path(self.root) / "store"
+
+    @property
+    def runs(self) -> Path:
+        """One folder per run with what people look at."""
+        return Path(self.root) / "runs"
+
+
+@dataclass(frozen=True)
+class TrackingConfig:
+    """Experiment tracking (``rtgs.track``)."""
+
+    kind: str = "mlflow"
+    """``off``, ``jsonl`` or ``mlflow``."""
+    uri: str = ""
+    """MLflow tracking URI; empty: ``sqlite:///<paths.root>/mlflow.db``."""
+    experiment: str = "rtgs/runs"
+    """Experiment of the runs; executed steps go to ``rtgs/steps``."""
+
+
+@dataclass(frozen=True)
+class AblationConfig:
+    """What an ablation file says about itself besides the one to three keys it flips."""
+
+    why: str = ""
+    """One line: what the flipped keys take away and what should be seen."""
+
+
+@dataclass(frozen=True)
+class EvaluationConfig:
+    """Which groups of metrics are computed (:class:`rtgs.evaluate.evaluate.EvaluationSettings`)."""
+
+    lpips: bool = True
+    masked: bool = True
+    eight_bit: bool = True
+
+
+@dataclass(frozen=True)
+class Choices:
+    """The files chosen from the config groups: names for tables, folders and the report."""
+
+    scene: str = ""
+    method: str = ""
+    preset: str = ""
+    ablation: str = "none"
+    experiment: str = ""
+    overrides: tuple[str, ...] = ()
+    """Keys set on the command line besides the groups."""
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """One run: a method trained on a scene with a budget, measured and reported."""
+
+    scene: SceneSettings = field(default_factory=SceneSettings)
+    method: MethodSettings = field(default_factory=MethodSettings)
+    schedule: ScheduleSettings = field(default_factory=ScheduleSettings)
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    ablation: AblationConfig = field(default_factory=AblationConfig)
+    tracking: TrackingConfig = field(default_factory=TrackingConfig)
+    paths: PathsConfig = field(default_factory=PathsConfig)
+    seed: int = 0
+    """Seed of everything random."""
+    name: str | None = None
+    """Folder under ``<root>/runs``. None: scene, method, preset, ablation and seed."""
+    threads: int | None = None
+    """Threads of torch and the native core. None: torch's default."""
+    mesh: bool = False
+    """Also extract a mesh from the trained surfels."""
+
+
+def open_schema(cls: type) -> type:
+    """A mutable twin of a frozen dataclass tree with the same fields: OmegaConf makes frozen ones read-only."""
+    return _twin(cls)
+
+
+@cache
+def _twin(cls: type) -> type:
+    hints = typing.get_type_hints(cls)
+    fields: list[Any] = []
+    for item in dataclasses.fields(cls):
+        hint = hints[item.name]
+        if dataclasses.is_dataclass(hint):
+            twin = _twin(typing.cast(type, hint))
+            default = dataclasses.field(default_factory=_defaults(item, twin))
+            fields.append((item.name, twin, default))
+        else:
+            default = dataclasses.field(default_factory=_defaults(item, None))
+            fields.append((item.name, hint, default))
+    return dataclasses.make_dataclass(cls.__name__, fields)
+
+
+def _defaults(item: dataclasses.Field[Any], twin: type | None) -> typing.Callable[[], Any]:
+    """A factory for the default of a field; nested dataclasses become their twins, value for value."""
+    if item.default is not dataclasses.MISSING:
+        value = item.default
+    elif item.default_factory is not dataclasses.MISSING:
+        value = item.default_factory()
+    else:
+        return lambda: "???"
+    return (lambda: _open(value, twin)) if twin is not None else (lambda: value)
+
+
+def _open(value: Any, twin: type) -> Any:
+    hints = typing.get_type_hints(twin)
+    return twin(
+        **{
+            item.name: _open(getattr(value, item.name), hints[item.name])
+            if dataclasses.is_dataclass(hints[item.name])
+            else getattr(value, item.name)
+            for item in dataclasses.fields(twin)
+        }
+    )
+
+
+def register_schema() -> None:
+    """Put the schema into Hydra's config store, under the name that ``conf/config.yaml`` lists first."""
+    from hydra.core.config_store import ConfigStore
+
+    from rtgs.config.locate import register_resolvers
+
+    register_resolvers()
+    ConfigStore.instance().store(name=SCHEMA_NAME, node=open_schema(RunConfig), provider="rtgs")
