@@ -2,7 +2,8 @@
 # rtgs::<isa>; binding sources once, for the baseline. Kernels hold no STL: the linker may keep the AVX-512 copy of a
 # weak template symbol and hand it to an old machine.
 set(RTGS_KERNELS
-  image_kernels.cpp
+  photometric_kernels.cpp
+  normal_kernels.cpp
   surfel_kernels.cpp
   optimizer_kernels.cpp
   raster_kernels.cpp)
