@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,11 +21,14 @@ class Finding:
     what: str  # what is wrong, with the value
     where: str  # the file, folder or image name
     what_to_do: str = ""
+    items: tuple[str, ...] = ()  # the paths concerned, all of them
 
     @property
     def message(self) -> str:
-        """One line: what, where, and what to do."""
-        return f"{self.what} [{self.where}]" + (f": {self.what_to_do}" if self.what_to_do else "")
+        """What, where, and what to do; one line, then one per item."""
+        where = "" if not self.where or self.where in self.what else f" [{self.where}]"
+        line = f"{self.what}{where}" + (f": {self.what_to_do}" if self.what_to_do else "")
+        return "\n".join([line, *(f"      {item}" for item in self.items)])
 
 
 @dataclass(frozen=True)
@@ -77,10 +81,12 @@ class Capture:
 
 
 def existing_side_file(folder: Path, image_name: str, suffixes: Sequence[str]) -> Path | None:
-    """The mask or normal file of an image: ``<image name><suffix>``, ``<image stem><suffix>`` in that order, with the
-    sub-folders of the image name and, failing that, without."""
+    """The mask or normal file of an image: ``<image name><suffix>`` or ``<image stem><suffix>``, in the sub-folders of
+    the image name; a leading ``images``, ``images_<N>`` or ``input`` may be absent."""
     relative = Path(image_name)
-    for base in dict.fromkeys((relative, Path(relative.name))):
+    inner = Path(*relative.parts[1:])
+    bases = (relative, inner) if re.fullmatch(r"images(_\d+)?|input|rgb", relative.parts[0]) else (relative,)
+    for base in bases:
         for suffix in suffixes:
             for candidate in (folder / f"{base}{suffix}", folder / base.with_suffix(suffix)):
                 if candidate.is_file():

@@ -78,10 +78,31 @@ def _read_model(folder: Path) -> Any:
     try:
         return pycolmap.Reconstruction(str(folder))
     except Exception as error:  # pycolmap raises whatever its C++ side threw: RuntimeError, ValueError, IndexError
+        non_finite = _non_finite_lines(folder)
+        if non_finite:
+            raise CaptureError(
+                f"the COLMAP model {folder} holds NaN or inf in {list_some(non_finite)}: remove these images or points "
+                "from the model, or register them again"
+            ) from error
         raise CaptureError(
             f"the COLMAP model {folder} cannot be read ({_first_line(error)}): a file is damaged, incomplete or of "
             "another program; export the model again"
         ) from error
+
+
+def _non_finite_lines(folder: Path) -> list[str]:
+    """Where a text model, which pycolmap then refuses to parse, holds NaN or inf; observation lines left out."""
+    if _model_suffix(folder) != ".txt":
+        return []
+    places = []
+    for part in _MODEL_PARTS:
+        lines = (folder / f"{part}.txt").read_text(encoding="utf-8", errors="replace").splitlines()
+        for number, line in enumerate(lines, start=1):
+            numbers = line.split()[: 9 if part == "images" else None]
+            if not line.startswith("#") and any(re.fullmatch(r"[+-]?(nan|inf)", n, re.IGNORECASE) for n in numbers):
+                name = f" ({line.split(maxsplit=9)[-1]})" if part == "images" else ""
+                places.append(f"{part}.txt line {number}{name}")
+    return places
 
 
 def _first_line(error: Exception) -> str:
@@ -94,7 +115,7 @@ def _lens(camera: Any) -> Lens:
 
 
 def _view(image: Any, lens: Lens, images_dir: Path, root: Path, settings: SceneSettings) -> CaptureView:
-    pose = image.cam_from_world() if callable(image.cam_from_world) else image.cam_from_world  # method since 3.12
+    pose: Any = image.cam_from_world() if callable(image.cam_from_world) else image.cam_from_world  # method since 3.12
     matrix = np.asarray(pose.matrix(), dtype=np.float64)
     masks, normals = settings.masks_dir, settings.normals_dir
     return CaptureView(

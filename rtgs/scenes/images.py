@@ -57,7 +57,7 @@ def read_photo(
 def has_alpha(path: Path) -> bool:
     """True when the image carries an alpha channel or a transparent palette entry."""
     with _open(path) as picture:
-        return picture.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in picture.info
+        return _has_alpha(picture)
 
 
 def read_mask(path: Path) -> np.ndarray:
@@ -69,13 +69,16 @@ def read_mask(path: Path) -> np.ndarray:
     with _open(path) as picture:
         try:
             picture.load()
-            if picture.mode == "P" and "transparency" not in picture.info:
-                picture = picture.convert("RGB")
-            pixels = _to_float(picture, path)
+            if _has_alpha(picture):
+                pixels = np.asarray(picture.convert("RGBA"))
+            else:
+                pixels = np.asarray(picture.convert("RGB") if picture.mode in ("P", "CMYK", "YCbCr") else picture)
         except _READ_ERRORS as error:
             raise _unreadable(path, error) from error
-    mask = (pixels[..., :3] > 0).any(-1)
-    return mask & (pixels[..., 3] > 0) if pixels.shape[2] == 4 else mask
+    if pixels.ndim == 2:
+        return pixels != 0
+    mask = (pixels[..., :3] != 0).any(-1)
+    return mask & (pixels[..., 3] != 0) if pixels.shape[2] == 4 else mask
 
 
 def read_normals(path: Path, frame: str = "opencv") -> np.ndarray:
@@ -177,6 +180,10 @@ def _unreadable(path: Path, error: Exception) -> CaptureError:
     )
 
 
+def _has_alpha(picture: Image.Image) -> bool:
+    return picture.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in picture.info
+
+
 def _turned_if_needed(picture: Image.Image, expected: tuple[int, int] | None) -> Image.Image:
     swapping = picture.getexif().get(_ORIENTATION_TAG) in _SWAPPING_ORIENTATIONS
     if expected is None or not swapping or same_aspect(picture.size, expected):
@@ -193,8 +200,7 @@ def _to_float(picture: Image.Image, path: Path) -> np.ndarray:
     if picture.mode == "F":
         grey = np.asarray(picture, dtype=np.float32)
         return _checked_range(np.repeat(grey[..., None], 3, axis=2), path)
-    alpha = picture.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in picture.info
-    pixels = np.asarray(picture.convert("RGBA" if alpha else "RGB"))
+    pixels = np.asarray(picture.convert("RGBA" if _has_alpha(picture) else "RGB"))
     return pixels.astype(np.float32) / np.float32(255.0)
 
 

@@ -82,7 +82,7 @@ def filter_points(
     distance = np.linalg.norm(cleared.positions - centers.mean(0), axis=1)
     close = np.ones(len(cleared), dtype=bool)
     if far_factor > 0 and len(cleared) >= _FAR_LEAST_POINTS:
-        close = distance <= far_factor * np.percentile(distance, _FAR_PERCENTILE)
+        close &= distance <= far_factor * np.percentile(distance, _FAR_PERCENTILE)
     return PointFilter(cleared.select(close), int((~finite).sum()), duplicate, int((~clear).sum()), int((~close).sum()))
 
 

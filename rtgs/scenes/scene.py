@@ -11,7 +11,7 @@ from torch import Tensor
 
 from rtgs.cameras import Camera
 from rtgs.scenes.capture import Capture, CaptureView, PointCloud, raise_errors
-from rtgs.scenes.check import capture_findings
+from rtgs.scenes.findings import capture_findings
 from rtgs.scenes.images import (
     area_resize,
     nearest_resize,
@@ -116,7 +116,7 @@ def load_scene(settings: SceneSettings) -> Scene:
             pixels, or the first unreadable file.
     """
     capture = read_capture(settings)
-    raise_errors(capture_findings(capture, settings), capture.root)
+    raise_errors(capture_findings(capture), capture.root)
     views = select_views(capture, settings)
     split = choose_split(capture, [view.name for view in views], settings)
     by_name = {view.name: view for view in views}

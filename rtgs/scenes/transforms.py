@@ -127,18 +127,14 @@ def _view(index: int, frame: Any, shared: dict[str, Any], settings: SceneSetting
 def _side_files(
     frame: dict[str, Any], name: str, root: Path, settings: SceneSettings
 ) -> tuple[Path | None, Path | None]:
-    """``mask_path`` and ``normal_file_path`` of the frame, else the files of masks_dir and normals_dir.
-
-    Side folders mirror the image name without its first folder (``images/a.jpg`` -> ``masks/a.png``).
-    """
-    inner = Path(*Path(name).parts[1:]).as_posix() if len(Path(name).parts) > 1 else name
+    """``mask_path`` and ``normal_file_path`` of the frame, else the files of masks_dir and normals_dir."""
     mask = normal = None
     if settings.masks_dir:
         named = frame.get("mask_path")
-        mask = root / named if named else existing_side_file(root / settings.masks_dir, inner, MASK_SUFFIXES)
+        mask = root / named if named else existing_side_file(root / settings.masks_dir, name, MASK_SUFFIXES)
     if settings.normals_dir:
         named = frame.get("normal_file_path")
-        normal = root / named if named else existing_side_file(root / settings.normals_dir, inner, NORMAL_SUFFIXES)
+        normal = root / named if named else existing_side_file(root / settings.normals_dir, name, NORMAL_SUFFIXES)
     return mask, normal
 
 

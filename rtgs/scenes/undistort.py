@@ -91,9 +91,8 @@ def check_lens(lens: Lens, name: str) -> str | None:
         return f"camera of {name}: parameters {lens.params} hold NaN or inf"
     if lens.width < 1 or lens.height < 1:
         return f"camera of {name}: image size {lens.width}x{lens.height}"
-    focals = lens.params[: 1 if _PINHOLE_PARAMETERS.get(lens.model) == 3 else 2]
-    if lens.model != "EQUIRECTANGULAR" and min(focals[:1]) <= 0:
-        return f"camera of {name}: focal length {focals[0]} is not positive"
+    if lens.model != "EQUIRECTANGULAR" and lens.params[0] <= 0:
+        return f"camera of {name}: focal length {lens.params[0]} is not positive"
     try:
         pinhole = lens.pinhole()
     except CaptureError as error:
@@ -132,8 +131,8 @@ def undistorted_lens(lens: Lens) -> Lens:
 
 @lru_cache(maxsize=2)
 def undistortion_map(lens: Lens) -> np.ndarray:
-    """For each pixel of the undistorted image the place in the distorted one: (H, W, 2) float32, in array index units
-    (pixel centres at integers), as ``cv2.remap`` wants it.
+    """For each pixel of the undistorted image the column and row in the distorted one: (2, H, W) float32, in array index
+    units (pixel centres at integers), as ``cv2.remap`` wants them.
 
     Raises:
         CaptureError: more than 1 % of the undistorted pixels fall outside the photo.
@@ -142,13 +141,13 @@ def undistortion_map(lens: Lens) -> np.ndarray:
     fx, fy, cx, cy = target.params
     camera = _colmap_camera(lens)
     x = (np.arange(target.width, dtype=np.float64) + 0.5 - cx) / fx
-    result = np.empty((target.height, target.width, 2), dtype=np.float32)
+    result = np.empty((2, target.height, target.width), dtype=np.float32)
     ray = np.ones((target.width, 3))
     ray[:, 0] = x
     for row in range(target.height):
         ray[:, 1] = (row + 0.5 - cy) / fy
-        result[row] = np.asarray(camera.img_from_cam(ray)) - 0.5
-    inside = (result >= -1).all(-1) & (result[..., 0] <= lens.width) & (result[..., 1] <= lens.height)
+        result[:, row] = np.asarray(camera.img_from_cam(ray)).T - 0.5
+    inside = (result >= -1).all(0) & (result[0] <= lens.width) & (result[1] <= lens.height)
     outside_share = 1 - float(inside.mean())
     if not outside_share <= _MAX_OUTSIDE_SHARE:
         raise CaptureError(
@@ -165,7 +164,7 @@ def undistort_image(image: np.ndarray, lens: Lens) -> np.ndarray:
     import cv2
 
     grid = undistortion_map(lens)
-    return cv2.remap(image, grid, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return cv2.remap(image, grid[0], grid[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 def undistort_nearest(image: np.ndarray, lens: Lens) -> np.ndarray:
@@ -173,8 +172,8 @@ def undistort_nearest(image: np.ndarray, lens: Lens) -> np.ndarray:
     if lens.is_pinhole:
         return image
     grid = undistortion_map(lens)
-    column = np.clip(np.rint(grid[..., 0]), 0, lens.width - 1).astype(np.intp)
-    row = np.clip(np.rint(grid[..., 1]), 0, lens.height - 1).astype(np.intp)
+    column = np.clip(np.rint(grid[0]), 0, lens.width - 1).astype(np.intp)
+    row = np.clip(np.rint(grid[1]), 0, lens.height - 1).astype(np.intp)
     return image[row, column]
 
 
