@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import re
-import types
-import typing
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from rtgs.config.build import build
 from rtgs.config.schema import Choices, RunConfig
 from rtgs.errors import RtgsError
 
@@ -49,35 +45,6 @@ def to_run_config(composed: DictConfig, choices: Choices) -> tuple[RunConfig, Ch
 
 def _absolute(path: str) -> str:
     return str(Path(os.path.expandvars(path)).expanduser().absolute().resolve())
-
-
-def build(cls: type, values: Mapping[str, Any]) -> Any:
-    """An instance of the (frozen) dataclass ``cls`` from plain containers."""
-    hints = typing.get_type_hints(cls)
-    unknown = sorted(set(values) - set(hints))
-    if unknown:
-        raise RtgsError(f"config: {cls.__name__} has no key {', '.join(unknown)}; it has {', '.join(hints)}")
-    return cls(
-        **{
-            item.name: _value(hints[item.name], values[item.name])
-            for item in dataclasses.fields(cls)
-            if item.name in values
-        }
-    )
-
-
-def _value(hint: Any, value: Any) -> Any:
-    if value is None:
-        return None
-    if dataclasses.is_dataclass(hint):
-        return build(typing.cast(type, hint), value)
-    if isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union:
-        (inner,) = [part for part in typing.get_args(hint) if part is not type(None)]
-        return _value(inner, value)
-    if typing.get_origin(hint) is tuple:
-        item = typing.get_args(hint)[0]
-        return tuple(_value(item, each) for each in typing.cast(Sequence[Any], value))
-    return value
 
 
 def derive_name(path: str) -> str:

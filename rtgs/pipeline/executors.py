@@ -54,10 +54,13 @@ class InlineExecutor:
         Raises:
             StepFailed: a step raised; its message names the step and ``__cause__`` is the step's own exception.
         """
-        total = len(plan)
-        return tuple(self._ensure(planned.step, f"[{i}/{total}]") for i, planned in enumerate(plan, start=1))
+        results: list[StepResult] = []
+        for number, planned in enumerate(plan, start=1):
+            executed = frozenset(result.step.fingerprint for result in results if result.executed)
+            results.append(self._ensure(planned.step, f"[{number}/{len(plan)}]", executed))
+        return tuple(results)
 
-    def _ensure(self, step: Step, position: str) -> StepResult:
+    def _ensure(self, step: Step, position: str, executed: frozenset[str]) -> StepResult:
         if artifact := self.store.find(step):
             log.info("%s %s from the cache", position, step.label)
             return _result(step, artifact, executed=False)
@@ -66,7 +69,7 @@ class InlineExecutor:
                 log.info("%s %s was made by another process", position, step.label)
                 return _result(step, artifact, executed=False)
             log.info("%s %s", position, step.label)
-            artifact = self._run(step)
+            artifact = self._run(step, executed)
             log.info("%s %s done in %.1f s", position, step.label, artifact.manifest.duration)
             return _result(step, artifact, executed=True)
 
@@ -83,7 +86,7 @@ class InlineExecutor:
         finally:
             lock.release()
 
-    def _run(self, step: Step) -> Artifact:
+    def _run(self, step: Step, executed: frozenset[str]) -> Artifact:
         """Execute under the lock. A failed attempt leaves nothing but its checkpoints."""
         self.store.discard_attempts(step)
         attempt, partial = self.store.new_attempt(step), self.store.partial(step)
@@ -95,7 +98,8 @@ class InlineExecutor:
         try:
             with self.tracking.run(info) as tracker:
                 tracker.params({key: _scalar(value) for key, value in flatten(step.recipe).items()})
-                context = StepContext(inputs, attempt, partial, logging.getLogger(f"rtgs.{step.name}"), tracker)
+                messages = logging.getLogger(f"rtgs.{step.name}")
+                context = StepContext(inputs, attempt, partial, messages, tracker, executed)
                 step.run(step.params, context)
                 return self.store.publish(step, attempt, time.perf_counter() - start)
         except Exception as error:

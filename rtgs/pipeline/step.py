@@ -28,6 +28,8 @@ class StepContext:
         partial: folder for checkpoints; survives a kill and is gone once the artifact is published.
         log: messages for the user.
         tracker: where parameters, curves and pictures of this execution go.
+        executed: fingerprints of the steps that ran so far under this plan; the others came from the cache. Only for
+            telling people: a result must not depend on it.
     """
 
     inputs: dict[str, Path]
@@ -35,6 +37,7 @@ class StepContext:
     partial: Path
     log: logging.Logger
     tracker: Tracker
+    executed: frozenset[str] = frozenset()
 
 
 StepFunction = Callable[[Any, StepContext], None]
