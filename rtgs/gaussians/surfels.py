@@ -8,6 +8,8 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
+from rtgs.gaussians.harmonics import evaluate_sh
+
 
 @dataclass
 class Surfels:
@@ -55,19 +57,36 @@ class ActivatedSurfels:
     colors: Tensor  # (N, 3) >= 0, SH evaluated at (mean - camera centre) / |.|
 
 
-def activate(surfels: Surfels, camera_center: Tensor, sh_degree: int) -> ActivatedSurfels:
-    """Activate with plain torch (any dtype, differentiable): the readable twin of the native path.
+SHORTEST = 1e-12  # a vector whose largest component is at most this counts as zero
+LOG_SCALE_LIMIT = 40.0  # log-scales act within +-this: scales, their squares and inverses stay normal float32 numbers
 
-    ``camera_center`` (3,) world; SH above ``sh_degree`` is left out.
-    """
-    from rtgs.gaussians.harmonics import evaluate_sh
 
-    q = torch.nn.functional.normalize(surfels.quaternions, dim=-1, eps=1e-12)
-    w, x, y, z = q.unbind(-1)
+def unit_or_zero(vectors: Tensor) -> Tensor:
+    """(N, C) vectors divided by their length, without overflow; those too short become zero and pass no gradient."""
+    largest = vectors.detach().abs().amax(-1, keepdim=True)  # cancels: no gradient by it
+    long = largest > SHORTEST
+    scaled = torch.where(long, vectors, 0.0) / torch.where(long, largest, 1.0)
+    square = (scaled * scaled).sum(-1, keepdim=True)
+    return scaled * torch.where(long, square, 1.0).rsqrt()
+
+
+def tangents(quaternions: Tensor) -> tuple[Tensor, Tensor]:
+    """Columns 0 and 1 of the rotations of (N, 4) quaternions of any length; a zero quaternion is the identity."""
+    w, x, y, z = unit_or_zero(quaternions).unbind(-1)
     tangent_u = torch.stack((1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)), -1)
     tangent_v = torch.stack((2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)), -1)
-    directions = torch.nn.functional.normalize(surfels.means - camera_center.to(surfels.means), dim=-1, eps=1e-12)
-    colors = evaluate_sh(surfels.sh_dc, surfels.sh_rest, directions, sh_degree).clamp_min(0)
-    return ActivatedSurfels(
-        surfels.means, tangent_u, tangent_v, surfels.log_scales.exp(), surfels.opacity_logits.sigmoid(), colors
-    )
+    return tangent_u, tangent_v
+
+
+def activate(surfels: Surfels, camera_center: Tensor, sh_degree: int) -> ActivatedSurfels:
+    """Activate with plain torch (any dtype, differentiable): the readable twin of ``activate_surfels``.
+
+    ``camera_center`` (3,) world, taken as constant; SH above ``sh_degree`` is left out. A mean at the camera centre has
+    no direction: its colour is that of degree 0, with no gradient by it.
+    """
+    tangent_u, tangent_v = tangents(surfels.quaternions)
+    scales = surfels.log_scales.clamp(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT).exp()
+    directions = unit_or_zero(surfels.means - camera_center.to(surfels.means))
+    degree = min(sh_degree, surfels.sh_degree)
+    colors = evaluate_sh(surfels.sh_dc, surfels.sh_rest, directions, degree).clamp_min(0)
+    return ActivatedSurfels(surfels.means, tangent_u, tangent_v, scales, surfels.opacity_logits.sigmoid(), colors)

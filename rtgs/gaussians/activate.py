@@ -1,0 +1,82 @@
+"""Native fused activation of surfels: tangents, scales, opacities, SH colours, and the backward pass.
+
+The readable twin is :func:`rtgs.gaussians.surfels.activate`; rules at degenerate input (zero
+quaternion, mean at the camera centre, extreme logits and log-scales) are the same in both.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from rtgs.gaussians.surfels import ActivatedSurfels, Surfels
+from rtgs.native import core
+
+
+def activate_surfels(surfels: Surfels, camera_center: Tensor, sh_degree: int) -> ActivatedSurfels:
+    """Activate for one camera, float32, differentiable by every raw parameter.
+
+    Args:
+        surfels: N surfels, float32 on the CPU.
+        camera_center: (3,) world; a constant (it gets no gradient).
+        sh_degree: active degree; capped by what the surfels hold.
+
+    Raises:
+        TypeError: a parameter is not float32 on the CPU.
+        ValueError: shapes do not match.
+    """
+    for name, tensor in surfels.items():
+        if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
+            raise TypeError(
+                f"surfels.{name} is {tensor.dtype} on {tensor.device}; activate_surfels takes float32 on the CPU "
+                "(rtgs.gaussians.surfels.activate takes any dtype)"
+            )
+    raw = tuple(tensor for _, tensor in surfels.items())
+    center = tuple(camera_center.tolist())
+    outputs = _Activate.apply(center, min(sh_degree, surfels.sh_degree), *raw)
+    return ActivatedSurfels(surfels.means, *outputs)
+
+
+def arrays(tensors: tuple[Tensor, ...]) -> tuple:
+    """Contiguous numpy views for a native call."""
+    return tuple(tensor.detach().contiguous().numpy() for tensor in tensors)
+
+
+class _Activate(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, center: tuple[float, float, float], degree: int, *raw: Tensor):
+        count = len(raw[0])
+        rows = raw[0].new_empty
+        outputs = (rows(count, 3), rows(count, 3), rows(count, 2), rows(count), rows(count, 3))
+        needs_backward = any(ctx.needs_input_grad)
+        saved = rows(core.activation_saved_size(count)) if needs_backward else None
+        core.activate_surfels(
+            arrays(raw),
+            center,
+            degree,
+            arrays(outputs),
+            None if saved is None else saved.numpy(),
+            torch.get_num_threads(),
+        )
+        if saved is not None:
+            _, _, scales, opacities, _ = outputs
+            ctx.save_for_backward(*raw, scales, opacities, saved)
+            ctx.center, ctx.degree = center, degree
+        return outputs
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, *upstream: Tensor):
+        *raw, scales, opacities, saved = ctx.saved_tensors
+        gradients = tuple(torch.empty_like(tensor, memory_format=torch.contiguous_format) for tensor in raw)
+        core.activate_surfels_backward(
+            arrays(tuple(raw)),
+            ctx.center,
+            ctx.degree,
+            *arrays((scales, opacities, saved)),
+            arrays(upstream),
+            arrays(gradients),
+            torch.get_num_threads(),
+        )
+        return None, None, *gradients
