@@ -70,7 +70,7 @@ class SurfelAdam:
     def __init__(
         self, surfels: Surfels, settings: OptimizerSettings, extent: float, *, means_lr_steps: int = 30_000
     ) -> None:
-        """``extent``: of the scene, world units; ``means_lr_steps``: length of the decay of the means' rate, in steps."""
+        """``extent``: of the scene, world units; ``means_lr_steps``: steps over which the means' rate decays."""
         if not (math.isfinite(extent) and extent > 0):
             raise ValueError(f"scene extent {extent} must be positive; are all training cameras at one place?")
         if means_lr_steps < 1:
@@ -106,8 +106,8 @@ class SurfelAdam:
             sh_degree: degree active in this step; default: all the surfels hold.
 
         Raises:
-            NonFiniteGradientError: a gradient held NaN or inf. Such values counted as 0, all others were applied: stop, or
-                go back to a checkpoint.
+            NonFiniteGradientError: a gradient held NaN or inf. Such values counted as 0, all others were applied: stop,
+                or go back to a checkpoint.
             RuntimeError: the surfels changed N without the optimiser.
         """
         degree = self.surfels.sh_degree if sh_degree is None else min(sh_degree, self.surfels.sh_degree)

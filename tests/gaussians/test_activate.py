@@ -36,17 +36,6 @@ def gradients(surfels: Surfels, outputs: list[torch.Tensor], upstream: list[torc
     return [torch.zeros_like(p) if g is None else g for p, g in zip(parameters, found)]
 
 
-def assert_rows_close(actual: torch.Tensor, expected: torch.Tensor, tolerance: float, what: str) -> None:
-    """Error of each row relative to the largest entry of the row in the float64 twin (and 1e-30 absolute)."""
-    if not expected.numel():
-        return
-    actual, expected = actual.double().reshape(len(actual), -1), expected.reshape(len(expected), -1)
-    error = (actual - expected).abs().amax(1)
-    bound = tolerance * expected.abs().amax(1) + 1e-30
-    worst = int((error / bound).argmax())
-    assert (error <= bound).all(), f"{what} row {worst}: {actual[worst].tolist()} against {expected[worst].tolist()}"
-
-
 def compare(surfels: Surfels, degree: int, tolerance: float = 1e-5) -> None:
     twin_surfels = in_double(surfels)
     native = outputs_of(activate_surfels(surfels, CENTER, degree))
