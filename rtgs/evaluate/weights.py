@@ -14,12 +14,14 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from rtgs.errors import RtgsError
 
-class MissingWeights(FileNotFoundError):
+
+class MissingWeights(RtgsError):
     """A pretrained file is not on this machine. The message names the places searched and where to get it."""
 
 
-class WrongWeights(ValueError):
+class WrongWeights(RtgsError):
     """A pretrained file is there but is not the expected one."""
 
 
@@ -93,12 +95,20 @@ def find_weights(file: PretrainedFile, folders: Iterable[Path] | None = None) ->
     for folder in searched:
         if (folder / file.filename).is_file():
             return folder / file.filename
-    places = ", ".join(str(folder) for folder in searched)
+    places = ", ".join(_readable(folder) for folder in searched)
     raise MissingWeights(
         f"weights missing: {file.filename} ({file.megabytes:g} MB, {file.used_for}); searched {places}. "
         f"Get it from {file.source} (licence: {file.licence}) and put it into one of these folders, "
         "or point RTGS_WEIGHTS to yours."
     )
+
+
+def _readable(folder: Path) -> str:
+    """A folder as a person would name it, without this machine's home in it."""
+    root, home = Path(__file__).resolve().parents[2], Path.home()
+    if folder.is_relative_to(root):
+        return f"{folder.relative_to(root)}/ beside the package"
+    return f"~/{folder.relative_to(home)}" if folder.is_relative_to(home) else str(folder)
 
 
 def verify_weights(file: PretrainedFile, path: Path) -> None:

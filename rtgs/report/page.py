@@ -1,0 +1,353 @@
+"""The report of a run: one self-contained HTML page. No file beside it, no network, opens anywhere.
+
+:func:`write_report` takes a :class:`ReportData`; every text in it is escaped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from torch import Tensor
+
+from rtgs.cameras import Camera
+from rtgs.evaluate.evaluate import EvaluationTable, ViewScore
+from rtgs.evaluate.images import ERROR_COLORMAP, ERROR_FULL_SCALE, error_map, to_bytes
+from rtgs.report.figures import (
+    DEPTH_COLORMAP,
+    Curve,
+    alpha_picture,
+    colorbar_uri,
+    curve_svg,
+    data_uri,
+    depth_picture,
+    image_bytes,
+    normal_picture,
+)
+
+TARGET_BYTES = 5_000_000  # of all pictures together, as base64
+# Tried in order until the pictures fit: long side in pixels, JPEG quality.
+PICTURE_STEPS = ((800, 90), (720, 87), (600, 85), (480, 82), (360, 80), (240, 75))
+
+
+@dataclass(frozen=True)
+class StepLine:
+    """One step of the pipeline as it went."""
+
+    name: str
+    fingerprint: str
+    hit: bool  # read from the cache instead of run
+    seconds: float | None = None  # of the execution that made the artifact
+    reason: str = ""  # why it had to run
+
+
+@dataclass(frozen=True)
+class Decision:
+    """Something the recipe could do and did not, or did differently, and why."""
+
+    what: str
+    why: str
+
+
+@dataclass(frozen=True)
+class ConfigLine:
+    """One resolved config value beside its default."""
+
+    key: str
+    value: str
+    default: str | None  # None: the default config has no such key
+
+    @property
+    def changed(self) -> bool:
+        return self.value != self.default
+
+
+@dataclass(frozen=True)
+class ReportView:
+    """One test view with its maps. Absent maps are left out of the page."""
+
+    name: str  # of a row of the evaluation
+    camera: Camera
+    photo: Tensor  # (3, H, W) in [0, 1]
+    render: Tensor  # (3, H, W)
+    role: str = ""  # why it was chosen: "best", "median", ...
+    depth: Tensor | None = None  # (H, W) z-depth of the surface, world units (divided by alpha)
+    normal: Tensor | None = None  # (3, H, W) world frame
+    alpha: Tensor | None = None  # (H, W)
+
+
+@dataclass(frozen=True)
+class MeshFigure:
+    """A picture of the extracted mesh."""
+
+    pixels: np.ndarray  # (H, W, 3) uint8
+    vertices: int
+    faces: int
+    note: str = ""  # how it was made
+
+
+@dataclass(frozen=True)
+class ReportData:
+    """Everything the page shows."""
+
+    title: str
+    evaluation: EvaluationTable
+    command: str = ""  # that repeats this run
+    created: str = ""
+    views: tuple[ReportView, ...] = ()
+    curves: tuple[Curve, ...] = ()
+    steps: tuple[StepLine, ...] = ()
+    decisions: tuple[Decision, ...] = ()
+    config: tuple[ConfigLine, ...] = ()
+    machine: Mapping[str, str] = field(default_factory=dict)  # processor, cores, threads, instruction set, versions
+    mesh: MeshFigure | None = None
+
+
+@dataclass(frozen=True)
+class Picture:
+    """An encoded picture with what is written under it."""
+
+    uri: str
+    title: str
+    caption: str = ""
+    scale_uri: str = ""  # a colour bar
+    scale_low: str = ""
+    scale_high: str = ""
+
+
+@dataclass(frozen=True)
+class ViewPanel:
+    """One view as the template takes it."""
+
+    name: str
+    role: str
+    score: ViewScore
+    width: int
+    height: int
+    photo: Picture
+    render: Picture
+    maps: tuple[Picture, ...]
+
+
+def pick_views(table: EvaluationTable, count: int = 4) -> list[tuple[int, str]]:
+    """Row numbers and roles of up to ``count`` views that stand for all: best, worst, and evenly between, by PSNR."""
+    order = sorted(range(len(table.rows)), key=lambda row: -(table.rows[row].values["psnr"] or 0.0))
+    if len(order) <= 1 or count <= 1:
+        return [(row, "") for row in order[:1]]
+    count = min(count, len(order))
+    places = [round(k * (len(order) - 1) / (count - 1)) for k in range(count)]
+    return [(order[place], _role(place, len(order))) for place in places]
+
+
+def _role(place: int, total: int) -> str:
+    if place == 0:
+        return "best"
+    return "worst" if place == total - 1 else f"rank {place + 1} of {total}"
+
+
+def config_lines(values: Mapping[str, object], defaults: Mapping[str, object]) -> tuple[ConfigLine, ...]:
+    """Dotted keys and values of the resolved config beside the defaults, sorted by key."""
+    return tuple(
+        ConfigLine(key, str(values[key]), str(defaults[key]) if key in defaults else None) for key in sorted(values)
+    )
+
+
+def write_report(path: Path, data: ReportData) -> int:
+    """Write the page and return its size in bytes.
+
+    Raises:
+        ValueError: a view that the evaluation does not have.
+    """
+    page = render_report(data).encode("utf-8")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(page)
+    return len(page)
+
+
+def render_report(data: ReportData) -> str:
+    """The page as a string."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+    from markupsafe import Markup
+
+    panels, mesh, picture_note = _pictures(data)
+    environment = Environment(
+        loader=PackageLoader("rtgs.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["number"] = _number
+    environment.filters["duration"] = _duration
+    return environment.get_template("report.html").render(
+        data=data,
+        table=data.evaluation,
+        columns=_columns(data.evaluation),
+        reasons=_reasons(data.evaluation),
+        panels=panels,
+        mesh=mesh,
+        picture_note=picture_note,
+        charts=[Markup(svg) for svg in _charts(data.curves) if svg],
+    )
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of the per-view table."""
+
+    metric: str
+    title: str
+    digits: int
+    factor: float = 1.0
+
+
+_ALWAYS = (
+    Column("psnr", "PSNR", 2),
+    Column("ssim", "SSIM", 4),
+    Column("lpips_01", "LPIPS [0,1]", 4),
+    Column("lpips_11", "LPIPS [−1,1]", 4),
+)
+_WHEN_PRESENT = (
+    Column("psnr_masked", "PSNR in mask", 2),
+    Column("ssim_masked", "SSIM in mask", 4),
+    Column("lpips_01_masked", "LPIPS [0,1] in mask", 4),
+    Column("lpips_11_masked", "LPIPS [−1,1] in mask", 4),
+    Column("psnr_8bit", "PSNR 8 bit", 2),
+    Column("ssim_8bit", "SSIM 8 bit", 4),
+    Column("lpips_01_8bit", "LPIPS [0,1] 8 bit", 4),
+    Column("render_seconds", "render, ms", 1, 1000.0),
+)
+
+
+def _columns(table: EvaluationTable) -> tuple[Column, ...]:
+    return _ALWAYS + tuple(column for column in _WHEN_PRESENT if table.count(column.metric))
+
+
+def _reasons(table: EvaluationTable) -> list[tuple[str, str]]:
+    """(columns, reason), columns with the same reason together."""
+    titles = {column.metric: column.title for column in _ALWAYS + _WHEN_PRESENT}
+    every_lpips = {metric for metric in titles if metric.startswith("lpips")}
+    grouped: dict[str, set[str]] = {}
+    for metric, reason in table.missing.items():
+        grouped.setdefault(reason, set()).add(metric)
+    lines = []
+    for reason, metrics in grouped.items():
+        names = [titles[metric] for metric in titles if metric in metrics]
+        lines.append(("LPIPS, all columns" if metrics == every_lpips else ", ".join(names), reason))
+    return lines
+
+
+def _charts(curves: Sequence[Curve]) -> list[str]:
+    """Loss terms (logarithmic), PSNR, surfel counts: by the names the trainer records."""
+    psnr = [curve for curve in curves if curve.name.endswith("/psnr")]
+    counts = [curve for curve in curves if curve.name.startswith("surfels/")]
+    losses = [curve for curve in curves if curve not in psnr and curve not in counts]
+    return [
+        curve_svg([_renamed(curve, "train/") for curve in losses], label="Loss terms", log=True),
+        curve_svg([_renamed(curve, "", "/psnr") for curve in psnr], label="PSNR, dB"),
+        curve_svg([_renamed(curve, "surfels/") for curve in counts], label="Surfels"),
+    ]
+
+
+def _renamed(curve: Curve, prefix: str, suffix: str = "") -> Curve:
+    return Curve(curve.name.removeprefix(prefix).removesuffix(suffix), curve.steps, curve.values)
+
+
+def _pictures(data: ReportData) -> tuple[list[ViewPanel], Picture | None, str]:
+    """All pictures at the first of PICTURE_STEPS that fits TARGET_BYTES."""
+    drawn = [_draw(view) for view in data.views]
+    scores = {row.view: row for row in data.evaluation.rows}
+    for view in data.views:
+        if view.name not in scores:
+            raise ValueError(f"report view {view.name!r} is not among the evaluated views {sorted(scores)}")
+    note, panels, mesh = "", [], None
+    for long_side, quality in PICTURE_STEPS:
+        panels = [
+            _panel(view, scores[view.name], pictures, long_side, quality)
+            for view, pictures in zip(data.views, drawn, strict=True)
+        ]
+        mesh = _mesh_picture(data.mesh, long_side, quality)
+        note = (
+            f"Pictures are JPEG (quality {quality}, at most {long_side} pixels); figures are measured on the renders."
+        )
+        if sum(_size(panel) for panel in panels) + len(mesh.uri if mesh else "") <= TARGET_BYTES:
+            break
+    return panels, mesh, note if panels or mesh else ""
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """A picture before it is encoded."""
+
+    pixels: np.ndarray
+    label: Picture  # everything but the address
+
+
+def _draw(view: ReportView) -> list[_Drawn]:
+    """Photo, render, then the maps, as pixels."""
+    drawn = [
+        _Drawn(to_bytes(view.photo), Picture("", "Photo")),
+        _Drawn(to_bytes(view.render), Picture("", "Render")),
+        _Drawn(
+            error_map(view.render, view.photo),
+            Picture(
+                "",
+                "Error",
+                "mean over RGB of |render − photo|",
+                colorbar_uri(ERROR_COLORMAP),
+                "0",
+                f"≥ {ERROR_FULL_SCALE:g}",
+            ),
+        ),
+    ]
+    depth = None if view.depth is None else depth_picture(view.depth, view.alpha)
+    if depth is not None:
+        caption = "z-depth in world units, even steps in 1/z; grey: alpha below one half"
+        near, far = f"far {depth.far:.3g}", f"near {depth.near:.3g}"
+        label = Picture("", "Depth", caption, colorbar_uri(DEPTH_COLORMAP), near, far)
+        drawn.append(_Drawn(depth.pixels, label))
+    if view.normal is not None:
+        caption = "camera frame: red right, green up, blue towards the viewer"
+        drawn.append(_Drawn(normal_picture(view.normal, view.camera), Picture("", "Normal", caption)))
+    if view.alpha is not None:
+        label = Picture("", "Alpha", "accumulated opacity", colorbar_uri("gray"), "0", "1")
+        drawn.append(_Drawn(alpha_picture(view.alpha), label))
+    return drawn
+
+
+def _panel(view: ReportView, score: ViewScore, drawn: list[_Drawn], long_side: int, quality: int) -> ViewPanel:
+    pictures = [_encoded(item.pixels, item.label, long_side, quality) for item in drawn]
+    height, width = view.photo.shape[1:]
+    return ViewPanel(view.name, view.role, score, width, height, pictures[0], pictures[1], tuple(pictures[2:]))
+
+
+def _encoded(pixels: np.ndarray, label: Picture, long_side: int, quality: int) -> Picture:
+    uri = data_uri(image_bytes(pixels, long_side, quality))
+    return Picture(uri, label.title, label.caption, label.scale_uri, label.scale_low, label.scale_high)
+
+
+def _mesh_picture(mesh: MeshFigure | None, long_side: int, quality: int) -> Picture | None:
+    if mesh is None:
+        return None
+    label = Picture("", "Mesh", f"{mesh.vertices:,} vertices, {mesh.faces:,} triangles. {mesh.note}".strip())
+    return _encoded(mesh.pixels, label, long_side, quality)
+
+
+def _size(panel: ViewPanel) -> int:
+    return sum(len(picture.uri) for picture in (panel.photo, panel.render, *panel.maps))
+
+
+def _number(value: float | None, digits: int = 2, factor: float = 1.0) -> str:
+    return "n/a" if value is None else f"{value * factor:,.{digits}f}"
+
+
+def _duration(seconds: float | None) -> str:
+    if seconds is None:
+        return "n/a"
+    if seconds < 100:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes:02d} min" if hours else f"{minutes} min {rest:02d} s"

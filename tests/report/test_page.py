@@ -1,0 +1,258 @@
+"""The report page: self-contained, escaped, honest about absent figures, small."""
+
+import base64
+import io
+import math
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from rtgs.cameras import Camera
+from rtgs.evaluate.evaluate import METRICS, EvaluationTable, RunFacts, ViewScore
+from rtgs.report.figures import Curve, curve_svg, depth_picture, image_bytes, normal_picture
+from rtgs.report.page import (
+    PICTURE_STEPS,
+    TARGET_BYTES,
+    Decision,
+    MeshFigure,
+    ReportData,
+    ReportView,
+    StepLine,
+    config_lines,
+    pick_views,
+    render_report,
+    write_report,
+)
+
+NASTY = "<script>alert('x')</script> & \"quoted\""
+
+
+class Outline(HTMLParser):
+    """Addresses a browser would load, and visible text."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.addresses: list[str] = []
+        self.tags: list[str] = []
+        self.text: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.addresses += [value or "" for name, value in attrs if name in ("src", "href", "srcset", "data", "action")]
+
+    def handle_data(self, data: str) -> None:
+        self.text.append(data)
+
+
+def score(view: str, psnr: float, width: int = 48, height: int = 32) -> ViewScore:
+    values: dict[str, float | None] = dict.fromkeys(METRICS)
+    values |= {"psnr": psnr, "ssim": 0.9, "psnr_8bit": psnr - 0.01, "ssim_8bit": 0.899, "render_seconds": 0.02}
+    return ViewScore(view, width, height, None, values)
+
+
+def table(count: int = 3) -> EvaluationTable:
+    rows = tuple(score(f"view_{k}.jpg", 20.0 + k) for k in range(count))
+    reasons = {name: "weights missing: vgg" for name in METRICS if name.startswith("lpips")}
+    return EvaluationTable(RunFacts("desk", "2dgs", "smoke", 300, 4321, 75.0, 512.0), rows, reasons)
+
+
+def report_view(name: str, width: int = 48, height: int = 32) -> ReportView:
+    generator = torch.Generator().manual_seed(len(name))
+    camera = Camera(torch.eye(3), torch.zeros(3), 40.0, 40.0, width / 2, height / 2, width, height)
+    photo = torch.rand(3, height, width, generator=generator)
+    alpha = torch.ones(height, width)
+    alpha[: height // 4] = 0
+    normal = torch.zeros(3, height, width)
+    normal[2] = -1
+    return ReportView(
+        name,
+        camera,
+        photo,
+        photo + 0.1,
+        "best",
+        depth=1 + torch.rand(height, width, generator=generator),
+        normal=normal,
+        alpha=alpha,
+    )
+
+
+def full_data() -> ReportData:
+    steps = tuple(range(0, 500, 50))
+    return ReportData(
+        title="desk, 2dgs",
+        evaluation=table(),
+        command="rtgs run scene=desk",
+        created="2026-01-02",
+        views=(report_view("view_0.jpg"), report_view("view_2.jpg")),
+        curves=(
+            Curve("train/loss", steps, tuple(1 / (step + 10) for step in steps)),
+            Curve("train/psnr", steps, tuple(20 + step / 100 for step in steps)),
+            Curve("surfels/base", steps, tuple(1000.0 + 40 * step for step in steps)),
+        ),
+        steps=(
+            StepLine("import_scene", "abcdef0123456789", True, 1.5),
+            StepLine("train_diffuse", "12345678ff", False, 75),
+        ),
+        decisions=(Decision("mono-normal loss", "off: the scene has no normals"),),
+        config=config_lines({"loss.normal": 0.04, "seed": 0}, {"loss.normal": 0.05, "seed": 0}),
+        machine={"threads": "2", "instruction set": "avx2"},
+        mesh=MeshFigure(np.full((20, 30, 3), 90, np.uint8), 1234, 2345, "TSDF"),
+    )
+
+
+def outline(page: str) -> Outline:
+    parser = Outline()
+    parser.feed(page)
+    parser.close()
+    return parser
+
+
+def test_page_is_self_contained(tmp_path: Path) -> None:
+    size = write_report(tmp_path / "out" / "report.html", full_data())
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert size == len(page.encode())
+    parsed = outline(page)
+    assert parsed.addresses
+    assert all(address.startswith("data:image/") for address in parsed.addresses)
+    assert "link" not in parsed.tags
+    assert "default-src 'none'" in page
+    assert not re.search(r"url\((?!#)", page)
+    pictures = [address for address in parsed.addresses if address.startswith("data:image/jpeg")]
+    assert len(pictures) == 2 * 6 + 1  # photo, render, error, depth, normal, alpha for two views, and the mesh
+    with Image.open(io.BytesIO(base64.b64decode(pictures[0].split(",")[1]))) as picture:
+        assert picture.size == (48, 32)
+
+
+def test_page_shows_the_figures_and_the_reasons() -> None:
+    text = " ".join(" ".join(outline(render_report(full_data())).text).split())
+    assert "21.00 dB" in text  # mean of 20, 21, 22
+    assert "4,321" in text
+    assert "1 min" not in text  # 75 s stay seconds
+    assert "75.0 s" in text
+    assert "n/a" in text
+    assert "weights missing: vgg" in text
+    assert "off: the scene has no normals" in text
+    assert "abcdef01" in text
+    assert "1,234 vertices, 2,345 triangles. TSDF" in text
+    assert "loss.normal" in text
+    assert "avx2" in text
+    assert "instruction set" in text
+
+
+def test_optional_parts_leave_no_trace() -> None:
+    page = render_report(ReportData("bare", table(1)))
+    headings = re.findall(r"<h2>(.*?)</h2>", page)
+    assert headings == ["Every test view", "What was run"]
+    assert "PSNR in mask" not in page
+
+
+def test_everything_is_escaped() -> None:
+    data = full_data()
+    evil_table = replace(
+        table(1),
+        facts=RunFacts(NASTY, NASTY, NASTY),
+        rows=(score(NASTY, 20.0),),
+        missing={"lpips_01": NASTY},
+    )
+    data = replace(
+        data,
+        title=NASTY,
+        evaluation=evil_table,
+        command=NASTY,
+        created=NASTY,
+        views=(replace(report_view(NASTY), role=NASTY),),
+        curves=(Curve(f"train/{NASTY}", (0, 1), (1.0, 0.5)), Curve("train/other", (0, 1), (1.0, 0.5))),
+        steps=(StepLine(NASTY, NASTY, False, None, NASTY),),
+        decisions=(Decision(NASTY, NASTY),),
+        config=config_lines({NASTY: NASTY}, {}),
+        machine={NASTY: NASTY},
+        mesh=MeshFigure(np.zeros((4, 4, 3), np.uint8), 1, 1, NASTY),
+    )
+    page = render_report(data)
+    assert page.count("<script>") == 1  # our own
+    assert "alert('x')</script>" not in page
+    assert NASTY in " ".join(outline(page).text)
+
+
+def test_big_pictures_shrink_until_they_fit() -> None:
+    generator = torch.Generator().manual_seed(0)
+    views, rows = [], []
+    for k in range(5):
+        view = report_view(f"view_{k}.jpg", 900, 700)  # noise does not compress
+        views.append(replace(view, photo=torch.rand(3, 700, 900, generator=generator), depth=None, normal=None))
+        rows.append(score(view.name, 20.0, 900, 700))
+    page = render_report(ReportData("big", replace(table(), rows=tuple(rows)), views=tuple(views)))
+    assert len(page) < TARGET_BYTES + 200_000
+    assert f"at most {PICTURE_STEPS[0][0]} pixels" not in page
+
+
+def test_view_that_was_not_evaluated_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"report view 'stray\.jpg' is not among"):
+        render_report(ReportData("x", table(), views=(report_view("stray.jpg"),)))
+
+
+def test_pick_views_spans_best_to_worst() -> None:
+    picked = pick_views(table(9), 3)
+    assert picked == [(8, "best"), (4, "rank 5 of 9"), (0, "worst")]
+    assert pick_views(table(1), 4) == [(0, "")]
+    assert [row for row, _ in pick_views(table(2), 4)] == [1, 0]
+
+
+def test_config_lines_mark_what_differs() -> None:
+    lines = config_lines({"b": 1, "a": 2.0, "new": "x"}, {"a": 2.0, "b": 3})
+    assert [(line.key, line.changed, line.default) for line in lines] == [
+        ("a", False, "2.0"),
+        ("b", True, "3"),
+        ("new", True, None),
+    ]
+
+
+def test_depth_picture_range_and_holes() -> None:
+    depth = torch.linspace(1, 5, 100).reshape(10, 10)
+    alpha = torch.ones(10, 10)
+    alpha[0] = 0.2
+    picture = depth_picture(depth, alpha)
+    assert picture is not None
+    assert 1.3 < picture.near < picture.far < 5
+    assert (picture.pixels[0] == 128).all()
+    warm, cold = picture.pixels[1, 0].astype(int), picture.pixels[9, 9].astype(int)
+    assert warm[0] > warm[2]  # near is red
+    assert cold[2] > cold[1]  # far is blue
+    assert depth_picture(torch.zeros(4, 4)) is None
+    assert depth_picture(torch.full((4, 4), 2.0)) is not None
+
+
+def test_normals_are_shown_in_the_camera_frame() -> None:
+    quarter = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])  # world -x is camera z
+    camera = Camera(quarter, torch.zeros(3), 5.0, 5.0, 1.0, 1.0, 2, 2)
+    facing = torch.zeros(3, 2, 2)
+    facing[0] = 1  # camera frame (0, 0, -1): towards the viewer
+    assert normal_picture(facing, camera)[0, 0].tolist() == [128, 128, 255]
+    assert normal_picture(torch.zeros(3, 2, 2), camera)[0, 0].tolist() == [128, 128, 128]
+
+
+def test_pictures_are_shrunk_never_enlarged() -> None:
+    pixels = np.zeros((30, 60, 3), np.uint8)
+    for long_side, size in ((20, (20, 10)), (100, (60, 30))):
+        with Image.open(io.BytesIO(image_bytes(pixels, long_side, 90))) as picture:
+            assert picture.size == size
+
+
+def test_curves_skip_what_cannot_be_drawn() -> None:
+    svg = curve_svg([Curve("a", (0, 1, 2), (1.0, math.nan, 2.0)), Curve("b", (0, 1), (0.0, -1.0))], label="x", log=True)
+    assert svg.startswith("<svg")
+    assert "var(--ink-soft)" in svg
+    assert "#010203" not in svg
+    assert curve_svg([Curve("b", (0, 1), (0.0, -1.0))], label="x", log=True) == ""
+    assert curve_svg([], label="x") == ""
+    assert curve_svg([Curve("a", (0, 1), (1.0, 2.0))], label="x") == curve_svg(
+        [Curve("a", (0, 1), (1.0, 2.0))], label="x"
+    )
+    with pytest.raises(ValueError, match="2 steps and 1 values"):
+        Curve("a", (0, 1), (1.0,))
