@@ -19,6 +19,7 @@ from rtgs.methods.base import (
 from rtgs.train.settings import MethodSettings, ScheduleSettings
 
 if TYPE_CHECKING:
+    from rtgs.methods.surfel_base import SurfelMethod
     from rtgs.scenes.scene import Scene
 
 METHOD_NAMES = ("2dgs", "rtgs")
@@ -35,14 +36,27 @@ def create_method(
     Raises:
         ValueError: no method has this name.
     """
+    return _method_class(settings)(settings, scene, schedule, generator)
+
+
+def method_stages(settings: MethodSettings, schedule: ScheduleSettings) -> tuple[Stage, ...]:
+    """The stages that the method ``settings.name`` goes through under ``schedule``, in order.
+
+    Raises:
+        ValueError: no method has this name.
+    """
+    return _method_class(settings).declare_stages(schedule)
+
+
+def _method_class(settings: MethodSettings) -> type[SurfelMethod]:
     if settings.name == "2dgs":
         from rtgs.methods.gs2d import Gs2d
 
-        return Gs2d(settings, scene, schedule, generator)
+        return Gs2d
     if settings.name == "rtgs":
         from rtgs.methods.rtgs import RtGs
 
-        return RtGs(settings, scene, schedule, generator)
+        return RtGs
     raise ValueError(f"method.name is {settings.name!r}: choose one of {', '.join(METHOD_NAMES)}")
 
 
@@ -57,4 +71,5 @@ __all__ = [
     "Stage",
     "StepEvent",
     "create_method",
+    "method_stages",
 ]

@@ -57,10 +57,15 @@ class SurfelMethod:
             means_lr_steps=schedule.means_lr_steps,
             extent=scene.extent,
         )
-        self.stages: tuple[Stage, ...] = (Stage("diffuse", 0, schedule.total),)
+        self.stages = self.declare_stages(schedule)
         self.starts, decisions = _decide_losses(settings, scene, schedule)
         self.decisions: tuple[Decision, ...] = decisions
         self._background = torch.tensor(settings.render.background)
+
+    @staticmethod
+    def declare_stages(schedule: ScheduleSettings) -> tuple[Stage, ...]:
+        """The stages of a run with this schedule, known before any scene is: one pipeline step each."""
+        return (Stage("diffuse", 0, schedule.total),)
 
     @property
     def sets(self) -> tuple[SurfelSet, ...]:
