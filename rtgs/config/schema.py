@@ -66,6 +66,8 @@ class Choices:
     """The files chosen from the config groups: names for tables, folders and the report."""
 
     scene: str = ""
+    """Name of the scene."""
+    scene_file: str = ""
     method: str = ""
     preset: str = ""
     ablation: str = "none"

@@ -1,0 +1,112 @@
+"""The graph of a run: import -> one training step per stage -> render -> evaluate -> report.
+
+Pure: from a config to steps with parameters; nothing runs here. Each step is given only what it reads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+
+from pipelines import evaluate, import_scene, render, report, train_diffuse
+from pipelines.training import StageParams
+from rtgs.config.schema import Choices, RunConfig
+from rtgs.methods import method_stages
+from rtgs.pipeline import Step, StepKind
+from rtgs.pipeline.fingerprint import flatten
+from rtgs.train.settings import MethodSettings, ScheduleSettings
+
+TRAINING: Mapping[str, StepKind] = {"diffuse": train_diffuse.STEP}
+"""The step that runs a stage, by the name the method gives it."""
+
+KINDS: tuple[StepKind, ...] = (import_scene.STEP, *TRAINING.values(), render.STEP, evaluate.STEP, report.STEP)
+"""Every kind of step there is; the guard against forgotten version bumps goes through them."""
+
+_NOT_SHOWN = ("paths.", "tracking.", "name", "threads", "scene.path", "method.paper_schedule.")
+
+
+@dataclass(frozen=True)
+class RunGraph:
+    """The steps of one run by what they give."""
+
+    scene: Step
+    training: tuple[Step, ...]
+    render: Step
+    evaluate: Step
+    report: Step
+
+    @property
+    def targets(self) -> tuple[Step, ...]:
+        """What a run asks for; everything else is upstream of it."""
+        return (self.report,)
+
+
+def build_graph(config: RunConfig, choices: Choices) -> RunGraph:
+    """The steps of ``rtgs run`` for this config. Reads the capture's poses and hashes its files, runs nothing.
+
+    Raises:
+        CaptureError: the capture cannot be read.
+        ValueError: no method of this name.
+    """
+    scene = import_scene.STEP.step(import_scene.import_params(config.scene))
+    training = _training(config, scene)
+    rendered = render.STEP.step(render.RenderParams(), scene, *training)
+    measured = evaluate.STEP.step(
+        evaluate.EvaluateParams(config.evaluation, method_label(choices), choices.preset),
+        scene,
+        *training,
+        rendered,
+        tools=_pretrained() if config.evaluation.lpips else (),
+    )
+    page = report.STEP.step(_report_params(config, choices), scene, *training, rendered, measured)
+    return RunGraph(scene, training, rendered, measured, page)
+
+
+def _training(config: RunConfig, scene: Step) -> tuple[Step, ...]:
+    method: MethodSettings = replace(config.method, paper_schedule=ScheduleSettings())  # a preset has read it by now
+    steps: list[Step] = []
+    for stage in method_stages(method, config.schedule):
+        params = StageParams(method, config.schedule, config.seed, stage.name, stage.from_step, stage.until)
+        steps.append(TRAINING[stage.name].step(params, scene, *steps))
+    return tuple(steps)
+
+
+def _pretrained() -> tuple[tuple[str, str], ...]:
+    """Which pretrained files LPIPS would find: the table changes when they arrive."""
+    from rtgs.evaluate.weights import REGISTRY, MissingWeights, find_weights
+
+    found = []
+    for name, file in sorted(REGISTRY.items()):
+        try:
+            find_weights(file)
+            found.append((name, file.sha256))
+        except MissingWeights:
+            found.append((name, "absent"))
+    return tuple(found)
+
+
+def method_label(choices: Choices) -> str:
+    """The method's name in tables; an ablation is part of it."""
+    return choices.method if choices.ablation in ("", "none") else f"{choices.method}, {choices.ablation}"
+
+
+def _report_params(config: RunConfig, choices: Choices) -> report.ReportParams:
+    values, defaults = shown_values(config), shown_values(RunConfig())
+    lines = tuple((key, str(values[key]), str(defaults.get(key, ""))) for key in sorted(values))
+    title = f"{config.scene.name}: {method_label(choices)}, {choices.preset}"
+    return report.ReportParams(title, command(choices), lines)
+
+
+def shown_values(config: RunConfig) -> dict[str, object]:
+    """Every value that has to do with the result, by dotted key."""
+    values = flatten(asdict(config))
+    return {key: value for key, value in values.items() if not key.startswith(_NOT_SHOWN)}
+
+
+def command(choices: Choices) -> str:
+    """The command line that repeats a run."""
+    groups = {"scene": choices.scene_file, "method": choices.method, "preset": choices.preset}
+    words = [f"{group}={name}" for group, name in groups.items() if name]
+    words += [f"ablation={choices.ablation}"] if choices.ablation not in ("", "none") else []
+    words += [f"experiment={choices.experiment}"] if choices.experiment else []
+    return " ".join(["rtgs run", *words, *choices.overrides])

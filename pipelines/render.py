@@ -1,0 +1,94 @@
+"""The trained method seen from the test cameras: images and maps."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pipelines.training import last_training, load_method
+from rtgs.pipeline import StepContext, StepKind
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from rtgs.evaluate.evaluate import TimedRender
+    from rtgs.methods import RenderedView
+
+TIMES_FILE = "render.json"
+
+
+@dataclass(frozen=True)
+class RenderParams:
+    """Which maps are kept besides the image."""
+
+    maps: bool = True
+    """Also depth, normal and alpha."""
+
+
+def render(params: RenderParams, context: StepContext) -> None:
+    """Render every test view.
+
+    Writes ``images/<stem>.png`` (8 bit), ``views/<stem>.safetensors`` (float32: image (3, H, W) not clamped, depth
+    (H, W) z-depth divided by alpha in world units, normal (3, H, W) world frame, alpha (H, W)) and ``render.json``
+    (seconds of each image).
+    """
+    import torch
+    from safetensors.torch import save_file
+
+    from rtgs.evaluate.images import file_stem, to_bytes, write_png
+    from rtgs.methods import RenderOptions
+    from rtgs.scenes.canonical import read_scene
+
+    scene = read_scene(context.inputs["import_scene"])
+    method, stage = load_method(last_training(context.inputs), scene)
+    seconds: dict[str, float] = {}
+    (context.out / "views").mkdir()
+    for view in scene.test:
+        stem = file_stem(view.name)
+        with torch.no_grad():
+            start = time.perf_counter()
+            image = method.render(view.camera, stage.until, RenderOptions()).image
+            seconds[view.name] = time.perf_counter() - start
+            tensors = {"image": image.contiguous()}
+            if params.maps:
+                options = RenderOptions(depth=True, normal=True)
+                tensors |= _maps(method.render(view.camera, stage.until, options))
+        save_file(tensors, context.out / "views" / f"{stem}.safetensors")
+        write_png(context.out / "images" / f"{stem}.png", to_bytes(image))
+    (context.out / TIMES_FILE).write_text(json.dumps({"seconds": seconds}, indent=1) + "\n", encoding="utf-8")
+    if seconds:
+        context.log.info("rendered %d test views, %.3f s each", len(seconds), sum(seconds.values()) / len(seconds))
+
+
+def _maps(rendered: RenderedView) -> dict[str, Tensor]:
+    buffers = rendered.buffers
+    assert buffers.depth is not None
+    assert buffers.normal is not None
+    depth = buffers.depth / buffers.alpha.clamp_min(1e-6)  # the buffer holds the sum of w z
+    maps = {"depth": depth, "normal": buffers.normal, "alpha": buffers.alpha}
+    return {name: tensor.contiguous() for name, tensor in maps.items()}
+
+
+def read_render(folder: Path, view_name: str) -> dict[str, Tensor]:
+    """The tensors of one rendered view."""
+    from safetensors.torch import load_file
+
+    from rtgs.evaluate.images import file_stem
+
+    return load_file(folder / "views" / f"{file_stem(view_name)}.safetensors")
+
+
+def read_timed(folder: Path, view_name: str) -> TimedRender:
+    """The image of one rendered view with the time it took."""
+    from rtgs.evaluate.evaluate import TimedRender
+
+    seconds = json.loads((folder / TIMES_FILE).read_text(encoding="utf-8"))["seconds"]
+    return TimedRender(read_render(folder, view_name)["image"], seconds[view_name])
+
+
+STEP = StepKind(
+    "render", 1, render, helpers=("pipelines.training", "rtgs.methods.surfel_base", "rtgs.render.rasterize")
+)

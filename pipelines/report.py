@@ -1,0 +1,109 @@
+"""One self-contained HTML page of a run: numbers, pictures, curves, and how it was made."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pipelines.evaluate import TABLE_JSON
+from pipelines.render import read_render
+from pipelines.training import last_training, read_history, read_summary
+from rtgs.pipeline import StepContext, StepKind
+from rtgs.pipeline.manifest import Manifest
+
+if TYPE_CHECKING:
+    from rtgs.evaluate.evaluate import EvaluationTable
+    from rtgs.report.figures import Curve
+    from rtgs.report.page import ReportView, StepLine
+
+PAGE = "report.html"
+
+
+@dataclass(frozen=True)
+class ReportParams:
+    """What the page says besides what it reads from the steps before it."""
+
+    title: str
+    command: str
+    config: tuple[tuple[str, str, str], ...]
+    """(key, value, default) of every config value that has to do with the result."""
+    views: int = 4
+    """How many test views are shown: the best, the worst, and evenly between."""
+
+
+def report(params: ReportParams, context: StepContext) -> None:
+    """Write ``report.html``."""
+    from rtgs.evaluate.evaluate import read_json
+    from rtgs.report.page import ConfigLine, Decision, ReportData, write_report
+
+    inputs = context.inputs
+    table = read_json(inputs["evaluate"] / TABLE_JSON)
+    training = last_training(inputs)
+    summary = read_summary(training)
+    manifest = Manifest.read(training)
+    assert manifest is not None
+    decisions = [Decision(**item) for item in summary["decisions"]]  # pyright: ignore[reportGeneralTypeIssues]
+    data = ReportData(
+        title=params.title,
+        evaluation=table,
+        command=params.command,
+        created=datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
+        views=_views(table, inputs, params.views),
+        curves=_curves(inputs),
+        steps=_steps(context),
+        decisions=tuple(decisions),
+        config=tuple(ConfigLine(*line) for line in params.config),
+        machine={key: str(value) for key, value in (manifest.machine | manifest.versions).items()},
+    )
+    size = write_report(context.out / PAGE, data)
+    context.log.info("report of %.1f MB", size / 1e6)
+    context.tracker.artifact(context.out / PAGE)
+
+
+def _views(table: EvaluationTable, inputs: Mapping[str, Path], count: int) -> tuple[ReportView, ...]:
+    from rtgs.report.page import ReportView, pick_views
+    from rtgs.scenes.canonical import read_scene
+
+    photos = {view.name: view for view in read_scene(inputs["import_scene"]).test}
+    views = []
+    for row, role in pick_views(table, count):
+        name = table.rows[row].view
+        maps = read_render(inputs["render"], name)
+        photo = photos[name]
+        shown = {key: maps.get(key) for key in ("depth", "normal", "alpha")}
+        views.append(ReportView(name, photo.camera, photo.image, maps["image"], role, **shown))
+    return tuple(views)
+
+
+def _curves(inputs: Mapping[str, Path]) -> tuple[Curve, ...]:
+    """Every recorded series, the stages of training joined."""
+    from rtgs.report.figures import Curve
+
+    series: dict[str, list[tuple[int, float]]] = {}
+    for name, folder in inputs.items():
+        if name.startswith("train_"):
+            for row in read_history(folder):
+                for key in row.keys() - {"step"}:
+                    series.setdefault(key, []).append((int(row["step"]), row[key]))
+    return tuple(
+        Curve(name, tuple(step for step, _ in points), tuple(value for _, value in points))
+        for name, points in sorted(series.items())
+    )
+
+
+def _steps(context: StepContext) -> tuple[StepLine, ...]:
+    from rtgs.report.page import StepLine
+
+    lines = []
+    for name, folder in context.inputs.items():
+        manifest = Manifest.read(folder)
+        assert manifest is not None
+        hit = manifest.fingerprint not in context.executed
+        lines.append(StepLine(name, manifest.fingerprint, hit, manifest.duration))
+    return tuple(lines)
+
+
+STEP = StepKind("report", 1, report, helpers=("rtgs.report.page", "rtgs.report.figures"))

@@ -1,0 +1,32 @@
+"""The first stage of every surfel method: the diffuse base set, rasterised."""
+
+from __future__ import annotations
+
+from pipelines.training import StageParams, train_stage
+from rtgs.pipeline import StepContext, StepKind
+
+
+def train_diffuse(params: StageParams, context: StepContext) -> None:
+    """Train the base set on the scene (:func:`pipelines.training.train_stage`)."""
+    train_stage(params, context)
+
+
+STEP = StepKind(
+    "train_diffuse",
+    1,
+    train_diffuse,
+    helpers=(
+        "pipelines.training",
+        "rtgs.methods.surfel_base",
+        "rtgs.methods.surfel_set",
+        "rtgs.train.trainer",
+        "rtgs.train.schedule",
+        "rtgs.train.losses",
+        "rtgs.train.adam",
+        "rtgs.gaussians.initialize",
+        "rtgs.gaussians.density",
+        "rtgs.gaussians.activate",
+        "rtgs.gaussians.ply",
+        "rtgs.render.rasterize",
+    ),
+)

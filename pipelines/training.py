@@ -1,0 +1,175 @@
+"""What the training steps share: parameters, the run of one stage, and reading a trained method back."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rtgs.config.build import build
+from rtgs.errors import RtgsError
+from rtgs.pipeline import StepContext
+from rtgs.pipeline.manifest import Manifest
+from rtgs.track import Tracker
+from rtgs.train.settings import MethodSettings, ScheduleSettings
+
+if TYPE_CHECKING:
+    from rtgs.methods import Method
+    from rtgs.scenes.scene import Scene
+
+CHECKPOINT_FOLDER = "checkpoint"
+SUMMARY_FILE = "summary.json"
+HISTORY_FILE = "history.jsonl"
+
+
+@dataclass(frozen=True)
+class StageParams:
+    """One stage of a training: the recipe, the seed, and which stretch of steps."""
+
+    method: MethodSettings
+    schedule: ScheduleSettings
+    seed: int
+    stage: str
+    from_step: int
+    until: int
+
+
+def train_stage(params: StageParams, context: StepContext) -> None:
+    """Train from ``from_step`` to ``until`` on the scene, going on from a checkpoint of a killed attempt.
+
+    Writes ``checkpoint/`` (state of the method at the end), ``<set>.ply`` for every set of surfels, ``summary.json``,
+    and ``history.jsonl`` (the recorded metrics).
+
+    Raises:
+        RtgsError: the method does not have this stage.
+        TrainingDiverged: a loss or gradient is not finite.
+    """
+    from rtgs.gaussians.ply import write_ply
+    from rtgs.methods import create_method
+    from rtgs.scenes.canonical import read_scene
+    from rtgs.train.progress import progress_for
+    from rtgs.train.seeds import generator_for
+    from rtgs.train.trainer import Trainer
+
+    scene = read_scene(context.inputs["import_scene"])
+    method = create_method(params.method, scene, params.schedule, generator_for(params.seed, "initialise"))
+    stage = next((stage for stage in method.stages if stage.name == params.stage), None)
+    if stage is None:
+        raise RtgsError(f"method {params.method.name} has no stage {params.stage!r}")
+    checkpoints = context.partial / "checkpoints"
+    _start_from_stage_before(context, checkpoints)
+    recorder = HistoryRecorder(context.partial / HISTORY_FILE, context.tracker)
+    trainer = Trainer(
+        method,
+        scene,
+        seed=params.seed,
+        stage=stage,
+        progress=progress_for(),
+        recorder=recorder,
+        checkpoint_dir=checkpoints,
+    )
+    summary = trainer.run()
+    newest = max(checkpoints.glob("step_*"))
+    shutil.copytree(newest, context.out / CHECKPOINT_FOLDER)
+    for surfel_set in method.sets:
+        write_ply(context.out / f"{surfel_set.name}.ply", surfel_set.surfels)
+    record = {key: _finite(value) for key, value in asdict(summary).items()}
+    (context.out / SUMMARY_FILE).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    recorder.write_history(context.out / HISTORY_FILE)
+    context.tracker.metrics({f"final/{key}": value for key, value in record.items() if type(value) in (int, float)})
+
+
+def _start_from_stage_before(context: StepContext, checkpoints: Path) -> None:
+    """A later stage goes on from the state at the end of the one before, unless it has a checkpoint of its own."""
+    before = [folder for name, folder in context.inputs.items() if name.startswith("train_")]
+    if not before or any(checkpoints.glob("step_*")):
+        return
+    record = json.loads((before[-1] / CHECKPOINT_FOLDER / "record.json").read_text(encoding="utf-8"))["record"]
+    shutil.copytree(before[-1] / CHECKPOINT_FOLDER, checkpoints / f"step_{record['step']:08d}")
+
+
+def _finite(value: object) -> object:
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+class HistoryRecorder:
+    """Metrics to a tracker and, one JSON object per line, to a file that survives a kill."""
+
+    def __init__(self, path: Path, tracker: Tracker) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self.path = path
+        self.tracker = tracker
+
+    def metrics(self, values: Mapping[str, float], step: int) -> None:
+        """Record numbers at an iteration."""
+        self.tracker.metrics(values, step)
+        with self.path.open("a", encoding="utf-8") as stream:
+            stream.write(
+                json.dumps({"step": step, **{key: _finite(float(value)) for key, value in values.items()}}) + "\n"
+            )
+
+    def write_history(self, path: Path) -> None:
+        """The history without what a killed attempt recorded past the checkpoint it was resumed from."""
+        rows: dict[int, dict[str, float]] = {}
+        lines = self.path.read_text(encoding="utf-8").splitlines() if self.path.exists() else []
+        for line in lines:
+            try:
+                row = json.loads(line)
+            except json.JSONDecodeError:  # cut by a kill; what follows was recorded by the attempt after
+                continue
+            rows = {step: kept for step, kept in rows.items() if step <= row["step"]}
+            rows[row["step"]] = rows.get(row["step"], {}) | row
+        path.write_text("".join(json.dumps(rows[step]) + "\n" for step in sorted(rows)), encoding="utf-8")
+
+
+def read_history(folder: Path) -> list[dict[str, float]]:
+    """Recorded metrics of a training artifact: one mapping per iteration, with its ``step``."""
+    lines = (folder / HISTORY_FILE).read_text(encoding="utf-8").splitlines()
+    return [{key: value for key, value in json.loads(line).items() if value is not None} for line in lines]
+
+
+def read_summary(folder: Path) -> dict[str, object]:
+    """``summary.json`` of a training artifact (fields of :class:`rtgs.train.trainer.TrainSummary`)."""
+    return json.loads((folder / SUMMARY_FILE).read_text(encoding="utf-8"))
+
+
+def stage_params(folder: Path) -> StageParams:
+    """The parameters a training artifact was made with, from its manifest.
+
+    Raises:
+        RtgsError: the folder is no artifact.
+    """
+    manifest = Manifest.read(folder)
+    if manifest is None:
+        raise RtgsError(f"{folder} has no readable manifest: run `rtgs cache gc`, then the command again")
+    return build(StageParams, manifest.params)
+
+
+def load_method(folder: Path, scene: Scene) -> tuple[Method, StageParams]:
+    """The method as it was at the end of a training stage."""
+    from rtgs.methods import create_method
+    from rtgs.train.checkpoint import load_checkpoint
+    from rtgs.train.seeds import generator_for
+
+    params = stage_params(folder)
+    method = create_method(params.method, scene, params.schedule, generator_for(params.seed, "initialise"))
+    tensors = load_checkpoint(folder / CHECKPOINT_FOLDER).tensors
+    prefix = "method."
+    method.load({name[len(prefix) :]: tensor for name, tensor in tensors.items() if name.startswith(prefix)})
+    return method, params
+
+
+def last_training(inputs: Mapping[str, Path]) -> Path:
+    """The folder of the training stage that ends latest among the inputs of a step.
+
+    Raises:
+        RtgsError: no training artifact among them.
+    """
+    folders = [folder for name, folder in inputs.items() if name.startswith("train_")]
+    if not folders:
+        raise RtgsError(f"no training step among the inputs {sorted(inputs)}")
+    return max(folders, key=lambda folder: stage_params(folder).until)
