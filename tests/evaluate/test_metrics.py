@@ -10,8 +10,11 @@ from hypothesis import strategies as st
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from rtgs.evaluate.metrics import absolute_error, psnr, quantized, ssim, ssim_map
+from rtgs.train import reference_losses
 
 HALF_WINDOW = 5
+PIXEL_ERROR = 3e-4  # of the float32 kernel
+MEAN_ERROR = 2e-6
 
 
 def random_pair(seed: int, height: int = 40, width: int = 33, noise: float = 0.1) -> tuple[torch.Tensor, torch.Tensor]:
@@ -45,7 +48,12 @@ def test_ssim_map_agrees_with_scikit_image_away_from_the_border(seed: int, noise
         full=True,
     )
     inside = (slice(HALF_WINDOW, -HALF_WINDOW),) * 2  # the border differs: scikit-image reflects, 3DGS pads with zeros
-    np.testing.assert_allclose(ssim_map(image, target)[inside].numpy(), expected.mean(2)[inside], atol=1e-10)
+    expected = expected.mean(2)[inside]
+    twin = reference_losses.ssim_map(image.clamp(0, 1).double(), target.double()).mean(0)
+    np.testing.assert_allclose(twin[inside].numpy(), expected, atol=1e-10)
+    ours = ssim_map(image, target)[inside].numpy()
+    np.testing.assert_allclose(ours, expected, atol=PIXEL_ERROR)
+    assert ours.mean() == pytest.approx(expected.mean(), abs=MEAN_ERROR)
 
 
 def test_ssim_pads_with_zeros() -> None:
@@ -62,7 +70,18 @@ def test_ssim_pads_with_zeros() -> None:
         data_range=1.0,
         full=True,
     )
-    assert ssim(image, target) == pytest.approx(float(expected[:, 20:-20, 20:-20].mean()), abs=1e-10)
+    expected = float(expected[:, 20:-20, 20:-20].mean())
+    assert ssim(image, target) == pytest.approx(expected, abs=MEAN_ERROR)
+    twin = reference_losses.ssim(image.clamp(0, 1).double(), target.double())
+    assert float(twin) == pytest.approx(expected, abs=1e-10)
+
+
+def test_ssim_of_flat_bright_pictures_keeps_its_digits() -> None:
+    """Where E[x^2] - E[x]^2 cancels most."""
+    target = torch.full((3, 64, 64), 0.98)
+    image = (target + 1e-3 * torch.randn(3, 64, 64, generator=torch.Generator().manual_seed(2))).clamp(0, 1)
+    twin = reference_losses.ssim(image.double(), target.double())
+    assert ssim(image, target) == pytest.approx(float(twin), abs=1e-5)
 
 
 def test_known_values() -> None:
