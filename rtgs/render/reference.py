@@ -334,12 +334,15 @@ def median_depth(depth: Tensor, decisions: PixelDecisions) -> Tensor:
 def distortion(weight: Tensor, before: Tensor, depth: Tensor, near: float, far: float) -> Tensor:
     """(P,) sum of w (m^2 (1 - T) + M2 - 2 m M1), m = far / (far - near) (1 - near / z) (methods.md 3.1).
 
-    Equal to the sum over pairs of w_i w_j (m_i - m_j)^2 (Huang et al. 2024, with squares as in their code).
+    Equal to the sum over pairs of w_i w_j (m_i - m_j)^2 (Huang et al. 2024, with squares as in their code), hence any
+    constant may be taken from m: the first visible surfel's, without which the sums cancel in float32.
     """
-    mapped = far / (far - near) * (1 - near / depth)
-    first = (weight * mapped).cumsum(1) - weight * mapped
-    second = (weight * mapped.square()).cumsum(1) - weight * mapped.square()
-    return (weight * (mapped.square() * (1 - before) + second - 2 * mapped * first)).sum(1)
+    visible = weight.detach() > 0
+    first = depth.detach().gather(1, visible.int().argmax(1, keepdim=True)) if depth.shape[1] else depth.new_ones(1, 1)
+    mapped = far * near / (far - near) * (1 / first - 1 / torch.where(visible, depth, first))
+    moment1 = (weight * mapped).cumsum(1) - weight * mapped
+    moment2 = (weight * mapped.square()).cumsum(1) - weight * mapped.square()
+    return (weight * (mapped.square() * (1 - before) + moment2 - 2 * mapped * moment1)).sum(1)
 
 
 def _maybe_checkpoint(
