@@ -1,0 +1,238 @@
+"""The run folder and the tracked run: what people look at, copied out of the store."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipelines.evaluate import TABLE_CSV, TABLE_JSON
+from pipelines.report import PAGE
+from pipelines.training import read_history, stage_params
+from rtgs.config.schema import Choices, RunConfig
+from rtgs.errors import RtgsError
+from rtgs.pipeline import Plan, StepResult, Store
+from rtgs.pipeline.fingerprint import flatten
+from rtgs.track import RunInfo, Tracker
+
+if TYPE_CHECKING:
+    from rtgs.evaluate.evaluate import EvaluationTable
+
+RUN_FILE = "run.json"
+_TRACKED_IMAGES = 4
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """``run.json`` of a run folder."""
+
+    name: str
+    command: str
+    finished: str  # UTC, ISO 8601
+    choices: dict[str, Any]
+    steps: dict[str, str]  # fingerprint by step name
+
+    @staticmethod
+    def read(folder: Path) -> RunRecord | None:
+        """The record of a run folder, or None where there is none."""
+        with suppress(OSError, ValueError, TypeError):
+            return RunRecord(**json.loads((folder / RUN_FILE).read_text(encoding="utf-8")))
+        return None
+
+
+def write_run_folder(config: RunConfig, choices: Choices, command: str, results: Sequence[StepResult]) -> Path:
+    """Copy what people look at into ``runs/<name>``; nothing is copied when it is all there already.
+
+    ``report.html``, ``metrics.json``, ``metrics.csv``, ``renders/``, ``errors/``, ``point_cloud.ply`` (the base set;
+    other sets under their own names), ``config.yaml``, ``run.json``.
+    """
+    folder = config.paths.runs / str(config.name)
+    steps = {result.step.name: result.step.fingerprint for result in results}
+    known = RunRecord.read(folder)
+    if known is not None and known.steps == steps and (folder / PAGE).is_file():
+        return folder
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / RUN_FILE).unlink(missing_ok=True)  # written last: a folder without it is incomplete
+    places = folders(results)
+    shutil.copyfile(places["report"] / PAGE, folder / PAGE)
+    for name in (TABLE_JSON, TABLE_CSV):
+        shutil.copyfile(places["evaluate"] / name, folder / name)
+    _replace_tree(places["render"] / "images", folder / "renders")
+    _replace_tree(places["evaluate"] / "errors", folder / "errors")
+    for ply in sorted(final_training(results).glob("*.ply")):
+        shutil.copyfile(ply, folder / ("point_cloud.ply" if ply.stem == "base" else ply.name))
+    for mesh in sorted(places["extract_mesh"].glob("*.ply")) if "extract_mesh" in places else ():
+        shutil.copyfile(mesh, folder / mesh.name)
+    (folder / "config.yaml").write_text(config_yaml(config), encoding="utf-8")
+    finished = datetime.now(UTC).isoformat(timespec="seconds")
+    record = RunRecord(str(config.name), command, finished, asdict(choices), steps)
+    (folder / RUN_FILE).write_text(json.dumps(asdict(record), indent=1) + "\n", encoding="utf-8")
+    return folder
+
+
+def _replace_tree(source: Path, target: Path) -> None:
+    if target.exists():
+        shutil.rmtree(target)
+    if source.exists():
+        shutil.copytree(source, target)
+
+
+def folders(results: Sequence[StepResult]) -> dict[str, Path]:
+    """The artifact folder of each step by name."""
+    return {result.step.name: result.folder for result in results}
+
+
+def final_training(results: Sequence[StepResult]) -> Path:
+    """The artifact of the last training stage."""
+    trained = [result.folder for result in results if result.step.name.startswith("train_")]
+    return max(trained, key=lambda folder: stage_params(folder).until)
+
+
+def config_yaml(config: RunConfig) -> str:
+    """The resolved config as YAML."""
+    from omegaconf import OmegaConf
+
+    values = asdict(config)
+    return OmegaConf.to_yaml(OmegaConf.create(json.loads(json.dumps(values))))
+
+
+def evaluation_of(results: Sequence[StepResult]) -> EvaluationTable:
+    """The measured table of a run."""
+    from rtgs.evaluate.evaluate import read_json
+
+    return read_json(folders(results)["evaluate"] / TABLE_JSON)
+
+
+def result_table(tables: Sequence[EvaluationTable]) -> str:
+    """Runs side by side in plain text; a figure that was not measured is ``n/a``."""
+    from rtgs.evaluate.tables import summarize
+
+    header = ("scene", "method", "preset", "views", "PSNR", "SSIM", "LPIPS", "train", "memory", "surfels")
+    rows = [header]
+    for row in summarize(tables):
+        rows.append(
+            (
+                row.scene,
+                row.method,
+                row.preset,
+                f"{row.views} of {row.resolution}",
+                _figure(row.psnr, "{:.2f} dB"),
+                _figure(row.ssim, "{:.4f}"),
+                _figure(row.lpips_01, "{:.4f}"),
+                _figure(row.train_seconds, "{:.1f} s"),
+                _figure(row.peak_memory_mb, "{:.0f} MB"),
+                _figure(row.surfels, "{:,}"),
+            )
+        )
+    widths = [max(len(row[column]) for row in rows) for column in range(len(header))]
+    return "\n".join("  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip() for row in rows)
+
+
+def _figure(value: float | None, form: str) -> str:
+    return "n/a" if value is None else form.format(value)
+
+
+def run_info(config: RunConfig, choices: Choices, plan: Plan) -> RunInfo:
+    """How a run appears in the tracker: names as tags, each step linked by its fingerprint."""
+    target = plan.steps[-1].step
+    tags = {f"rtgs.{key}": getattr(choices, key) for key in ("scene", "method", "preset", "ablation", "experiment")}
+    tags |= {f"rtgs.step.{planned.step.name}": planned.step.fingerprint for planned in plan}
+    return RunInfo(
+        config.tracking.experiment, str(config.name), target.fingerprint, tags | {"rtgs.seed": str(config.seed)}
+    )
+
+
+def track_start(tracker: Tracker, config: RunConfig, plan: Plan) -> None:
+    """Parameters and the plan."""
+    values = flatten(asdict(config))
+    hidden = ("paths.", "tracking.", "method.paper_schedule.")
+    tracker.params({key: _scalar(value) for key, value in values.items() if not key.startswith(hidden)})
+    tracker.table("plan", plan_rows(plan))
+
+
+def track_end(tracker: Tracker, folder: Path, results: Sequence[StepResult]) -> None:
+    """Curves over real iterations, final figures, the per-view table, a few pictures, the files of the run folder."""
+    for result in results:
+        if result.step.name.startswith("train_"):
+            for row in read_history(result.folder):
+                step = int(row.pop("step"))
+                tracker.metrics(row, step)
+    table = evaluation_of(results)
+    means = {name: table.mean(name) for name in table.rows[0].values}
+    tracker.metrics({f"eval/{name}": value for name, value in means.items() if value is not None})
+    facts = {"train_seconds": table.facts.train_seconds, "peak_memory_mb": table.facts.peak_memory_mb}
+    tracker.metrics({f"cost/{name}": value for name, value in facts.items() if value is not None})
+    tracker.metrics({"surfels": float(table.facts.surfels or 0)})
+    tracker.table("eval", [{"view": row.view, **row.values} for row in table.rows])
+    for path in sorted((folder / "renders").glob("*.png"))[:_TRACKED_IMAGES]:
+        _track_png(tracker, f"renders/{path.stem}", path)
+        _track_png(tracker, f"errors/{path.stem}", folder / "errors" / path.name)
+    for name in (PAGE, TABLE_JSON, TABLE_CSV, "config.yaml", RUN_FILE, "point_cloud.ply"):
+        if (folder / name).is_file():
+            tracker.artifact(folder / name)
+
+
+def _track_png(tracker: Tracker, name: str, path: Path) -> None:
+    import numpy as np
+    from PIL import Image
+
+    if path.is_file():
+        tracker.image(name, np.asarray(Image.open(path).convert("RGB")))
+
+
+def plan_rows(plan: Plan) -> list[Mapping[str, str]]:
+    """One row per step of a plan."""
+    return [
+        {
+            "step": planned.step.name,
+            "key": planned.step.fingerprint[:12],
+            "state": "cached" if planned.hit else "to run",
+            "why": planned.reason,
+        }
+        for planned in plan
+    ]
+
+
+def _scalar(value: object) -> str | int | float | bool | None:
+    return value if value is None or isinstance(value, (str, int, float, bool)) else str(value)
+
+
+def report_page(folder: Path, store: Store) -> Path:
+    """The report in a run folder; copied out of the store again when it is gone.
+
+    Raises:
+        RtgsError: it is in neither place.
+    """
+    page = folder / PAGE
+    if page.is_file():
+        return page
+    record = RunRecord.read(folder)
+    key = record.steps.get("report", "") if record else ""
+    cached = store.root / "report" / key[:2] / key / PAGE
+    if not cached.is_file():
+        repeat = record.command if record else "rtgs run ..."
+        raise RtgsError(f"{page} is gone and not in the store either; `{repeat}` makes it again")
+    shutil.copyfile(cached, page)
+    return page
+
+
+def find_run(runs: Path, name: str | None) -> Path:
+    """The folder of the named run, or of the one that finished last.
+
+    Raises:
+        RtgsError: there is none.
+    """
+    found = {folder.name: record for folder in sorted(runs.glob("*")) if (record := RunRecord.read(folder))}
+    if name is None:
+        if not found:
+            raise RtgsError(f"no finished run in {runs}; start one with `rtgs run`")
+        name = max(found, key=lambda each: found[each].finished)
+    elif name not in found:
+        listed = ", ".join(found) or "none"
+        raise RtgsError(f"no finished run {name!r} in {runs}; there is {listed}")
+    return runs / name

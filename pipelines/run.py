@@ -1,0 +1,182 @@
+"""``rtgs run``: compose a config, plan, run what is missing, show the result. Also ``python -m pipelines.run``."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from collections.abc import Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from omegaconf import DictConfig
+
+from rtgs.config.compose import VERSION_BASE, choices_from
+from rtgs.config.convert import to_run_config
+from rtgs.config.locate import choices_of, conf_dir
+from rtgs.config.schema import Choices, RunConfig, register_schema
+from rtgs.errors import RtgsError
+from rtgs.pipeline import InlineExecutor, Plan, StepResult, Store, make_plan
+from rtgs.track import open_tracking
+
+log = logging.getLogger("rtgs")
+
+
+@dataclass(frozen=True)
+class RunOutcome:
+    """What a run gave."""
+
+    plan: Plan
+    results: tuple[StepResult, ...]
+    folder: Path
+
+
+def execute(config: RunConfig, choices: Choices) -> RunOutcome:
+    """Plan the run, execute what the store lacks, write the run folder, print the table.
+
+    Raises:
+        StepFailed: a step raised.
+        CaptureError: the capture cannot be read.
+    """
+    from pipelines.graph import build_graph, command
+
+    _set_threads(config.threads)
+    store = Store(config.paths.store)
+    plan = make_plan(build_graph(config, choices).targets, store)
+    log.info("%s", describe(plan))
+    results, folder = _run(config, choices, store, plan, command(choices))
+    _show(results, folder)
+    return RunOutcome(plan, results, folder)
+
+
+def _run(
+    config: RunConfig, choices: Choices, store: Store, plan: Plan, command: str
+) -> tuple[tuple[StepResult, ...], Path]:
+    from pipelines.results import run_info, track_end, track_start, write_run_folder
+
+    if plan.complete:  # nothing to record: the tracker saw this run when it was executed
+        results = InlineExecutor(store).execute(plan)
+        return results, write_run_folder(config, choices, command, results)
+    tracking = open_tracking(config.tracking.kind, Path(config.paths.root), config.tracking.uri)
+    with tracking.run(run_info(config, choices, plan)) as tracker:
+        track_start(tracker, config, plan)
+        results = InlineExecutor(store, tracking).execute(plan)
+        folder = write_run_folder(config, choices, command, results)
+        track_end(tracker, folder, results)
+    return results, folder
+
+
+def describe(plan: Plan) -> str:
+    """One line: how many steps, how many are cached."""
+    text = f"{len(plan)} steps, {plan.hits} from the cache"
+    return f"{text}, nothing to do" if plan.complete else text
+
+
+def _show(results: Sequence[StepResult], folder: Path) -> None:
+    from pipelines.report import PAGE
+    from pipelines.results import evaluation_of, result_table
+
+    print(f"\n{result_table([evaluation_of(results)])}\n\nreport: {_short(folder / PAGE)}")
+
+
+def _short(path: Path) -> str:
+    relative = os.path.relpath(path)
+    return str(path) if relative.startswith("..") else relative
+
+
+def _set_threads(threads: int | None) -> None:
+    if threads is None:
+        return
+    if threads < 1:
+        raise RtgsError(f"config: threads={threads} must be at least 1")
+    import torch
+
+    torch.set_num_threads(threads)
+
+
+def friendly_overrides(arguments: Sequence[str]) -> list[str]:
+    """Make a folder as good as a scene's name: ``scene=/my/capture`` or ``scene.path=/my/capture`` alone."""
+    rewritten: list[str] = []
+    for argument in arguments:
+        key, _, value = argument.partition("=")
+        plain = value.strip("'\"")
+        if (
+            key == "scene"
+            and "," not in value
+            and plain not in choices_of("scene")
+            and Path(plain).expanduser().is_dir()
+        ):
+            rewritten += ["scene=capture", f"scene.path={_quoted(plain)}"]
+        elif key == "scene.path" and not value.startswith(("'", '"')) and Path(value).expanduser().exists():
+            rewritten.append(f"scene.path={_quoted(value)}")
+        else:
+            rewritten.append(argument)
+    keys = {argument.partition("=")[0] for argument in rewritten}
+    if "scene.path" in keys and "scene" not in keys:
+        rewritten.insert(0, "scene=capture")
+    return rewritten
+
+
+def _quoted(text: str) -> str:
+    escaped = text.replace("\\", "\\\\").replace("'", "\\'") if "'" in text else text
+    return f"'{escaped}'"
+
+
+class HydraApp:
+    """The task function behind Hydra; keeps the error of a single run, so that Hydra adds nothing to it."""
+
+    def __init__(self) -> None:
+        self.error: Exception | None = None
+
+    def __call__(self, composed: DictConfig) -> None:
+        """One job."""
+        from hydra.core.hydra_config import HydraConfig
+        from hydra.types import RunMode
+
+        hydra = HydraConfig.get()
+        try:
+            execute(*to_run_config(composed, choices_from(hydra.runtime.choices, hydra.overrides.task)))
+        except Exception as error:
+            if hydra.mode == RunMode.MULTIRUN:
+                log.error("job %s (%s): %s", hydra.job.num, hydra.job.override_dirname, error)
+                raise
+            self.error = error
+
+
+def run_hydra(arguments: Sequence[str]) -> None:
+    """Compose and run; raises what the job raised."""
+    import hydra
+
+    register_schema()
+    app = HydraApp()
+
+    def task(composed: DictConfig) -> None:
+        app(composed)
+
+    decorated = hydra.main(version_base=VERSION_BASE, config_path=str(conf_dir()), config_name="config")(task)
+    with _command_line(["rtgs run", *friendly_overrides(arguments)]):
+        decorated()
+    if app.error is not None:
+        raise app.error
+
+
+@contextmanager
+def _command_line(words: list[str]):
+    """Hydra reads ``sys.argv``, and hands errors on unformatted with ``HYDRA_FULL_ERROR``."""
+    saved, full = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
+    sys.argv, os.environ["HYDRA_FULL_ERROR"] = words, "1"
+    try:
+        yield
+    finally:
+        sys.argv = saved
+        if full is None:
+            del os.environ["HYDRA_FULL_ERROR"]
+        else:
+            os.environ["HYDRA_FULL_ERROR"] = full
+
+
+if __name__ == "__main__":
+    from rtgs.cli import main
+
+    sys.exit(main(["run", *sys.argv[1:]]))

@@ -1,0 +1,254 @@
+"""The ``rtgs`` command: run, plan, cache, check, weights, report, dashboard."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import traceback
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING
+
+from rtgs import __version__
+from rtgs.errors import RtgsError
+
+if TYPE_CHECKING:
+    from rtgs.pipeline import Store
+
+USAGE = f"""rtgs {__version__}: Gaussian models of scenes with glass and mirrors, on the CPU
+
+  rtgs run [group=choice] [key=value]     train, render, measure, report; what is cached is not run again
+  rtgs plan [group=choice] [key=value]    what `rtgs run` with the same words would do, and why
+  rtgs check FOLDER | scene=NAME          what is wrong with a capture, before any training
+  rtgs report [RUN]                       where the report of the latest (or the named) run is
+  rtgs cache ls | gc | verify             the artifact store
+  rtgs weights                            pretrained files: what is known, what is there; downloads nothing
+  rtgs dashboard                          MLflow's pages on this machine
+
+  rtgs COMMAND --help tells more. RTGS_DEBUG=1 shows tracebacks."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit code."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if not words or words[0] in ("-h", "--help", "help"):
+        print(USAGE)
+        return 0 if words else 2
+    if words[0] == "--version":
+        print(__version__)
+        return 0
+    command = COMMANDS.get(words[0])
+    if command is None:
+        print(f"rtgs: unknown command {words[0]!r}\n\n{USAGE}", file=sys.stderr)
+        return 2
+    try:
+        return command(words[1:])
+    except KeyboardInterrupt:
+        print("\nrtgs: interrupted; the same command goes on from the last checkpoint", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except Exception as error:
+        return report_error(error)
+
+
+def report_error(error: Exception) -> int:
+    """Print an error: one message where the user can mend it, a traceback where the program is at fault."""
+    if os.environ.get("RTGS_DEBUG") or not is_for_users(error):
+        traceback.print_exception(error)
+    else:
+        from rtgs.config.explain import explain
+
+        print(f"rtgs: {explain(error) if _of_config(error) else error}", file=sys.stderr)
+    return 1
+
+
+def is_for_users(error: BaseException) -> bool:
+    """Whether the message of an error is meant for users: our own types, values our code refused, the disk."""
+    inner = getattr(error, "error", error)  # what a step raised
+    if isinstance(inner, (RtgsError, OSError)) or _of_config(inner) or type(inner).__module__.startswith("rtgs."):
+        return True
+    return isinstance(inner, (ValueError, TypeError)) and _raised_in_project(inner.__traceback__)
+
+
+def _of_config(error: BaseException) -> bool:
+    return type(error).__module__.split(".")[0] in ("hydra", "omegaconf")
+
+
+def _raised_in_project(trace: TracebackType | None) -> bool:
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    return trace is not None and trace.tb_frame.f_globals.get("__name__", "").split(".")[0] in ("rtgs", "pipelines")
+
+
+def run(words: list[str]) -> int:
+    """``rtgs run``: everything after it goes to Hydra."""
+    from pipelines.run import run_hydra
+
+    run_hydra(words)
+    return 0
+
+
+def plan(words: list[str]) -> int:
+    """``rtgs plan``: the steps of a run, cached or not, and why not."""
+    if words[:1] in (["-h"], ["--help"]):
+        print("rtgs plan [group=choice] [key=value]\n\nThe words of `rtgs run`; prints the plan and runs nothing.")
+        return 0
+    from pipelines.graph import build_graph
+    from pipelines.results import plan_rows
+    from pipelines.run import describe, friendly_overrides
+    from rtgs.config import compose
+    from rtgs.pipeline import Store, make_plan
+
+    config, choices = compose(friendly_overrides(words))
+    planned = make_plan(build_graph(config, choices).targets, Store(config.paths.store))
+    rows = [("step", "key", "state", "why"), *(tuple(row.values()) for row in plan_rows(planned))]
+    print(_columns(rows))
+    print(f"\n{describe(planned)}")
+    return 0
+
+
+def cache(words: list[str]) -> int:
+    """``rtgs cache ls | gc | verify``."""
+    from rtgs.pipeline import Store
+
+    parser = argparse.ArgumentParser("rtgs cache", description="The artifact store.")
+    parser.add_argument("action", choices=("ls", "gc", "verify"), help="list, remove garbage, check every digest")
+    parser.add_argument("--root", type=Path, default=_root(), help="folder that holds store/ (default: %(default)s)")
+    parser.add_argument("--partial", action="store_true", help="gc: also checkpoints of unfinished steps")
+    parser.add_argument("--older-than", type=float, metavar="DAYS", help="gc: also artifacts made before that")
+    options = parser.parse_args(words)
+    store = Store(options.root / "store")
+    if options.action == "ls":
+        return _list(store)
+    if options.action == "verify":
+        return _verify(store)
+    removed = store.collect_garbage(partial=options.partial, older_than=options.older_than)
+    print(f"removed {len(removed.paths)} folders, {removed.size / 1e6:.1f} MB")
+    return 0
+
+
+def _list(store: Store) -> int:
+    artifacts = sorted(store.artifacts(), key=lambda artifact: artifact.manifest.created)
+    rows = [("step", "key", "made", "took", "size")]
+    for artifact in artifacts:
+        manifest = artifact.manifest
+        size, took = f"{manifest.size / 1e6:.1f} MB", f"{manifest.duration:.1f} s"
+        rows.append((manifest.step, manifest.fingerprint[:12], manifest.created, took, size))
+    print(_columns(rows))
+    total = sum(artifact.manifest.size for artifact in artifacts)
+    print(f"\n{len(artifacts)} artifacts, {total / 1e6:.1f} MB in {store.root}")
+    return 0
+
+
+def _verify(store: Store) -> int:
+    count, broken = 0, 0
+    for artifact, defects in store.verify():
+        count += 1
+        if defects:
+            broken += 1
+            print(f"{artifact.folder}\n" + "\n".join(f"  {defect}" for defect in defects))
+    print(
+        f"{count} artifacts, {count - broken} sound" + (f", {broken} damaged: delete their folders" if broken else "")
+    )
+    return 1 if broken else 0
+
+
+def check(words: list[str]) -> int:
+    """``rtgs check``: everything wrong with a capture; exit code 1 when it cannot be trained on."""
+    if not words or words[0] in ("-h", "--help"):
+        print("rtgs check FOLDER | scene=NAME [scene.key=value]\n")
+        print("Lists what is wrong with a capture; reads every photo, mask and normal map.")
+        return 0 if words else 2
+    from pipelines.run import friendly_overrides
+    from rtgs.config import compose
+    from rtgs.scenes.check import check_capture
+
+    first = words[0] if "=" in words[0] else f"scene.path={words[0]}"
+    config, _ = compose(friendly_overrides([first, *words[1:]]))
+    findings = check_capture(config.scene)
+    errors = sum(finding.severity == "error" for finding in findings)
+    for finding in findings:
+        print(finding)
+    verdict = f"{errors} errors: not ready for training" if errors else "ready for training"
+    print(f"{config.scene.name}: {len(findings)} findings, {verdict}")
+    return 1 if errors else 0
+
+
+def weights(words: list[str]) -> int:
+    """``rtgs weights``: pretrained files by name."""
+    argparse.ArgumentParser("rtgs weights", description="Pretrained files; nothing is downloaded.").parse_args(words)
+    from rtgs.evaluate.weights import weight_folders, weights_report
+
+    for status in weights_report():
+        file = status.file
+        print(f"{file.name}: {file.used_for}")
+        print(f"  file     {file.filename}, {file.megabytes:g} MB, sha256 {file.sha256}")
+        print(f"  state    {f'present at {status.path}' if not status.problem else 'absent or wrong'}")
+        print(f"  licence  {file.licence}")
+        print(f"  source   {file.source}")
+        if status.path is not None and status.problem:
+            print(f"  problem  {status.problem}")
+    print("\nfolders searched, the first that has the file wins (RTGS_WEIGHTS names one more):")
+    for folder in weight_folders():
+        print(f"  {folder}")
+    return 0
+
+
+def report(words: list[str]) -> int:
+    """``rtgs report``: print where the page is, and open it on request."""
+    parser = argparse.ArgumentParser("rtgs report", description="The report of the latest or the named run.")
+    parser.add_argument("run", nargs="?", help="name of a folder in runs/ (default: the run that finished last)")
+    parser.add_argument("--root", type=Path, default=_root(), help="folder that holds runs/ (default: %(default)s)")
+    parser.add_argument("--open", action="store_true", help="open it in the browser")
+    options = parser.parse_args(words)
+    from pipelines.results import find_run, report_page
+    from rtgs.pipeline import Store
+
+    page = report_page(find_run(options.root / "runs", options.run), Store(options.root / "store"))
+    print(page)
+    if options.open:
+        import webbrowser
+
+        webbrowser.open(page.absolute().as_uri())
+    return 0
+
+
+def dashboard(words: list[str]) -> int:
+    """``rtgs dashboard``: MLflow's own server on the loopback address."""
+    parser = argparse.ArgumentParser("rtgs dashboard", description="MLflow's pages on http://127.0.0.1:PORT.")
+    parser.add_argument("--root", type=Path, default=_root(), help="folder that holds mlflow.db (default: %(default)s)")
+    parser.add_argument("--port", type=int, default=5000)
+    options = parser.parse_args(words)
+    database = (options.root / "mlflow.db").absolute()
+    if not database.is_file():
+        raise RtgsError(f"{database} does not exist yet: `rtgs run` (with tracking=mlflow) makes it")
+    import subprocess
+
+    environment = os.environ | {"MLFLOW_DISABLE_TELEMETRY": "true", "DO_NOT_TRACK": "true"}
+    print(f"http://127.0.0.1:{options.port}  (experiments rtgs/runs and rtgs/steps; Ctrl-C ends it)", flush=True)
+    server = [sys.executable, "-m", "mlflow", "ui", "--host", "127.0.0.1", "--port", str(options.port)]
+    return subprocess.run([*server, "--backend-store-uri", f"sqlite:///{database}"], env=environment).returncode
+
+
+def _root() -> Path:
+    return Path(os.environ.get("RTGS_ROOT", "."))
+
+
+def _columns(rows: Sequence[Sequence[str]]) -> str:
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    return "\n".join("  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip() for row in rows)
+
+
+COMMANDS: dict[str, Callable[[list[str]], int]] = {
+    "run": run,
+    "plan": plan,
+    "cache": cache,
+    "check": check,
+    "weights": weights,
+    "report": report,
+    "dashboard": dashboard,
+}
