@@ -96,9 +96,9 @@ def recipes(kind: str) -> st.SearchStrategy[Recipe]:
         Recipe,
         kind=st.just(kind),
         seed=st.integers(0, 2**31),
-        count=st.integers(1, 48),
-        width=st.integers(1, 41),
-        height=st.integers(1, 37),
+        count=st.integers(1, 40),
+        width=st.integers(1, 35),
+        height=st.integers(1, 33),
         channels=st.integers(1, 32),
         background=st.booleans(),
     )
@@ -190,6 +190,20 @@ def _opacity(rng: np.random.Generator, parts: _Parts) -> _Parts:
         )
     )
     return replace(parts, opacities=choices[rng.integers(0, 4, n), np.arange(n)])
+
+
+def wild(seed: int, count: int) -> SurfelScene:
+    """An ordinary scene in which a share of all values, drawn per tensor, becomes +-1e-30 to 1e30."""
+    rng = np.random.default_rng(seed)
+    scene = build(Recipe("ordinary", seed, count, 24, 19, 4))
+    tensors = []
+    for tensor in scene.surfels.all():
+        values = tensor.numpy().copy()
+        extreme = rng.uniform(size=values.shape) < rng.choice((0.0, 0.1, 0.5, 1.0))
+        sign = rng.choice((-1, 1), values.shape) if (values < 0).any() else 1
+        values[extreme] = (sign * 10.0 ** rng.uniform(-30, 30, values.shape))[extreme]
+        tensors.append(torch.tensor(values))
+    return replace(scene, surfels=SurfelTensors(*tensors))
 
 
 def _behind(rng: np.random.Generator, parts: _Parts) -> _Parts:

@@ -1,0 +1,67 @@
+"""The native rasteriser against its twin: hypothesis-drawn scenes, errors pooled over all examples of a test.
+
+Ordinary scenes: pictures within 1e-5 of their maximum on all but 1e-3 of the pixels, gradients within 1e-4 of their
+largest element. Degenerate scenes: the larger of these and four times the error of the twin itself run in float32.
+Pixels on a discontinuity are flagged, counted, and given no upstream gradient.
+"""
+
+import pytest
+import torch
+from hypothesis import given, settings
+
+from rtgs.render.rasterize import rasterize_surfels
+
+from .strategies import DEGENERATE, Recipe, recipes
+from .twin_runs import Pools, expected, rounded, run
+
+PIXEL_TOLERANCE, PIXEL_SHARE = 1e-5, 1e-3
+GRADIENT_TOLERANCE = 1e-4
+SLACK = 4.0  # of degenerate scenes, over the twin in float32
+
+
+def pool_examples(kind: str, examples: int, *, with_twin: bool = False) -> tuple[Pools, Pools]:
+    """Errors of the native kernel over drawn scenes of a kind, and of the float32 twin if asked for."""
+    native, twin = Pools(), Pools()
+
+    @settings(max_examples=examples, deadline=None, derandomize=True, database=None)
+    @given(recipe=recipes(kind))
+    def draw(recipe: Recipe) -> None:
+        answer = expected(recipe)
+        native.add(run(rasterize_surfels, answer.scene, torch.float32, answer.upstream), answer)
+        if with_twin:
+            twin.add(rounded(recipe), answer)
+
+    draw()
+    return native, twin
+
+
+def test_ordinary_scenes(isa: str):
+    pools, _ = pool_examples("ordinary", 40)
+    assert pools.pictures["alpha"].total > 5000
+    assert pools.flagged_share < 0.1
+    for name, pool in pools.pictures.items():
+        assert pool.share_beyond(PIXEL_TOLERANCE) <= PIXEL_SHARE, f"{name}: worst {pool.worst:.1e}"
+    for name, pool in pools.gradients.items():
+        assert pool.worst <= GRADIENT_TOLERANCE, name
+    assert pools.weight_sum.share_beyond(PIXEL_TOLERANCE) <= PIXEL_SHARE
+
+
+@pytest.mark.parametrize("kind", DEGENERATE)
+def test_degenerate_scenes(isa: str, kind: str):
+    pools, twin = pool_examples(kind, 12, with_twin=True)
+    assert pools.flagged_share < 0.5
+    for name, pool in pools.pictures.items():
+        allowed = max(PIXEL_SHARE, SLACK * twin.pictures[name].share_beyond(PIXEL_TOLERANCE))
+        assert pool.share_beyond(PIXEL_TOLERANCE) <= allowed, f"{name}: worst {pool.worst:.1e}"
+    for name, pool in pools.gradients.items():
+        assert pool.worst <= max(GRADIENT_TOLERANCE, SLACK * twin.gradients[name].worst), name
+
+
+@pytest.mark.parametrize("channels", range(1, 33))
+def test_every_channel_count(isa: str, channels: int):
+    answer = expected(Recipe("ordinary", 100 + channels, 12, 19, 17, channels))
+    pools = Pools()
+    pools.add(run(rasterize_surfels, answer.scene, torch.float32, answer.upstream), answer)
+    assert pools.pictures["features"].share_beyond(PIXEL_TOLERANCE) <= 4 / (19 * 17)
+    assert pools.gradients["features"].worst <= GRADIENT_TOLERANCE
+    assert pools.gradients["means"].worst <= GRADIENT_TOLERANCE
