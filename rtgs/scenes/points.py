@@ -70,7 +70,7 @@ def filter_points(
         near_camera: radius around cameras, in extents.
         far_factor: 0 keeps all far points.
     """
-    finite = np.isfinite(points.positions).all(1) & np.isfinite(points.colors).all(1)
+    finite = np.asarray(np.isfinite(np.concatenate([points.positions, points.colors], axis=1)).all(axis=1))
     kept = points.select(finite)
     _, first = np.unique(kept.positions, axis=0, return_index=True)
     unique = kept.select(np.sort(first))
@@ -80,9 +80,10 @@ def filter_points(
         clear &= np.linalg.norm(unique.positions - center, axis=1) >= near_camera * extent
     cleared = unique.select(clear)
     distance = np.linalg.norm(cleared.positions - centers.mean(0), axis=1)
-    close = np.ones(len(cleared), dtype=bool)
+    limit = np.inf
     if far_factor > 0 and len(cleared) >= _FAR_LEAST_POINTS:
-        close &= distance <= far_factor * np.percentile(distance, _FAR_PERCENTILE)
+        limit = far_factor * float(np.percentile(distance, _FAR_PERCENTILE))
+    close = np.asarray(distance <= limit)
     return PointFilter(cleared.select(close), int((~finite).sum()), duplicate, int((~clear).sum()), int((~close).sum()))
 
 

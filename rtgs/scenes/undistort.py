@@ -131,8 +131,9 @@ def undistorted_lens(lens: Lens) -> Lens:
 
 @lru_cache(maxsize=2)
 def undistortion_map(lens: Lens) -> np.ndarray:
-    """For each pixel of the undistorted image the column and row in the distorted one: (2, H, W) float32, in array index
-    units (pixel centres at integers), as ``cv2.remap`` wants them.
+    """Column and row in the distorted image of each pixel of the undistorted one: (2, H, W) float32.
+
+    They are array indices (pixel centres at integers), as ``cv2.remap`` wants them.
 
     Raises:
         CaptureError: more than 1 % of the undistorted pixels fall outside the photo.

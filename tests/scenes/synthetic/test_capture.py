@@ -16,7 +16,9 @@ GLASS = Material(kind="thin_glass")
 
 
 def description(*shapes, count=6):
-    return SceneDescription("test", "Test", shapes, Viewpoints(count=count, radius=(2.0, 2.2), rings=2), (0.0, 0.0, 0.0))
+    return SceneDescription(
+        "test", "Test", shapes, Viewpoints(count=count, radius=(2.0, 2.2), rings=2), (0.0, 0.0, 0.0)
+    )
 
 
 def test_a_lamp_appears_where_the_camera_projects_it():
