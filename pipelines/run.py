@@ -124,10 +124,15 @@ def _quoted(text: str) -> str:
 
 
 class HydraApp:
-    """The task function behind Hydra; keeps the error of a single run, so that Hydra adds nothing to it."""
+    """The task function behind Hydra.
+
+    Keeps the error of a single run, so that Hydra adds nothing to it, and what the jobs of a sweep in this process gave.
+    """
 
     def __init__(self) -> None:
         self.error: Exception | None = None
+        self.outcomes: list[RunOutcome] = []
+        self.failures: list[str] = []
 
     def __call__(self, composed: DictConfig) -> None:
         """One job."""
@@ -136,12 +141,26 @@ class HydraApp:
 
         hydra = HydraConfig.get()
         try:
-            execute(*to_run_config(composed, choices_from(hydra.runtime.choices, hydra.overrides.task)))
+            config, choices = to_run_config(composed, choices_from(hydra.runtime.choices, hydra.overrides.task))
+            self.outcomes.append(execute(config, choices))
         except Exception as error:
             if hydra.mode == RunMode.MULTIRUN:
-                log.error("job %s (%s): %s", hydra.job.num, hydra.job.override_dirname, error)
+                self.failures.append(f"job {hydra.job.num} ({hydra.job.override_dirname}): {error}")
+                log.error("%s", self.failures[-1])
                 raise
             self.error = error
+
+    def summary(self) -> str:
+        """Table and failures of a sweep whose jobs ran in this process; empty otherwise."""
+        if len(self.outcomes) + len(self.failures) < 2:
+            return ""
+        from pipelines.results import evaluation_of, result_table
+
+        parts = [result_table([evaluation_of(outcome.results) for outcome in self.outcomes])] if self.outcomes else []
+        if self.failures:
+            total = len(self.outcomes) + len(self.failures)
+            parts.append("\n".join([f"{len(self.failures)} of {total} jobs failed:", *self.failures]))
+        return "\n\n".join(parts)
 
 
 def run_hydra(arguments: Sequence[str]) -> None:
@@ -155,8 +174,12 @@ def run_hydra(arguments: Sequence[str]) -> None:
         app(composed)
 
     decorated = hydra.main(version_base=VERSION_BASE, config_path=str(conf_dir()), config_name="config")(task)
-    with _command_line(["rtgs run", *friendly_overrides(arguments)]):
-        decorated()
+    try:
+        with _command_line(["rtgs run", *friendly_overrides(arguments)]):
+            decorated()
+    finally:
+        if text := app.summary():
+            print(f"\n{text}")
     if app.error is not None:
         raise app.error
 

@@ -172,7 +172,7 @@ def check(words: list[str]) -> int:
     findings = check_capture(config.scene)
     errors = sum(finding.severity == "error" for finding in findings)
     for finding in findings:
-        print(finding)
+        print(f"{finding.severity}: {finding.message}")
     verdict = f"{errors} errors: not ready for training" if errors else "ready for training"
     print(f"{config.scene.name}: {len(findings)} findings, {verdict}")
     return 1 if errors else 0

@@ -1,0 +1,195 @@
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+
+from rtgs.config import AblationConfig, RunConfig, compose, locate
+from rtgs.config.build import build
+from rtgs.config.convert import derive_name
+from rtgs.config.explain import explain
+from rtgs.config.locate import choices_of, conf_dir
+from rtgs.config.schema import open_schema
+from rtgs.errors import RtgsError
+from rtgs.pipeline.fingerprint import fingerprint
+from rtgs.train.settings import ScheduleSettings
+
+ABLATIONS = [name for name in choices_of("ablation") if name != "none"]
+SCENES = [name for name in choices_of("scene") if name != "capture"]
+
+
+def recipe(config: RunConfig) -> RunConfig:
+    """What the steps read: without the words about it."""
+    return dataclasses.replace(config, ablation=AblationConfig(), name=None)
+
+
+@pytest.fixture
+def conf_copy(tmp_path, monkeypatch) -> Path:
+    """A copy of conf/ that a test may spoil."""
+    shutil.copytree(conf_dir(), tmp_path / "conf")
+    monkeypatch.setattr(sys.modules["rtgs.config.compose"], "conf_dir", lambda: tmp_path / "conf")
+    return tmp_path / "conf"
+
+
+def message(*overrides: str) -> str:
+    with pytest.raises((HydraException, RtgsError)) as raised:
+        compose(overrides)
+    return explain(raised.value) if isinstance(raised.value, HydraException) else str(raised.value)
+
+
+def test_defaults_are_the_schema_and_the_chosen_files():
+    config, choices = compose([])
+    assert (choices.method, choices.preset, choices.ablation) == ("rtgs", "quick", "none")
+    assert config.name == "glass_demo-rtgs-quick"
+    assert config.scene.path == str(locate.project_root() / "data" / "glass_demo")
+    assert Path(config.paths.root).is_absolute()
+    assert isinstance(config.scene.background, tuple)
+
+
+def test_the_schema_has_the_defaults_of_the_dataclasses():
+    plain = OmegaConf.to_container(OmegaConf.structured(open_schema(RunConfig)))
+    assert isinstance(plain, dict)
+    assert build(RunConfig, plain) == RunConfig()  # pyright: ignore[reportArgumentType]
+
+
+def test_the_command_line_wins_over_files_and_preset():
+    config, choices = compose(["scene=fox", "method=2dgs", "schedule.total=33", "scene.long_side=64", "seed=3"])
+    assert (config.schedule.total, config.scene.long_side, config.seed) == (33, 64, 3)
+    assert config.name == "fox-2dgs-quick-seed3"
+    assert choices.overrides == ("schedule.total=33", "scene.long_side=64", "seed=3")
+
+
+@pytest.mark.parametrize(
+    ("override", "expected"),
+    [
+        ("method.los.l1=3", ["Key 'los' not in 'MethodSettings'", "method.los", "Did you mean loss"]),
+        ("metod=2dgs", ["metod", "Did you mean method"]),
+        ("schedule.totl=3", ["schedule.totl", "Did you mean total"]),
+        ("method.loss.l1=abc", ["'abc' of type 'str' could not be converted to Float", "method.loss.l1"]),
+        ("schedule.total=1.5", ["schedule.total", "Integer"]),
+        ("scene=nope", ["scene/nope", "fox"]),
+        ("+foo=3", ["no key foo"]),
+        ("seed=[1", ["'seed=[1' is not a legal override", "quotes"]),
+        ("scene.format=colmp", ["colmp", "did you mean 'colmap'"]),
+    ],
+)
+def test_a_mistake_on_the_command_line_is_named(override, expected):
+    if override.startswith("scene.format"):
+        with pytest.raises(ValueError, match="colmp") as raised:
+            compose([override])
+        text = str(raised.value)
+    else:
+        text = message(override)
+    for part in expected:
+        assert part in text
+
+
+@pytest.mark.parametrize(
+    ("group", "content", "expected"),
+    [
+        ("method", "name: 2dgs\nlos:\n  l1: 1.0\n", ["method/spoilt", "'los'", "Did you mean loss"]),
+        ("method", "name: 2dgs\nloss:\n  l1: much\n", ["method/spoilt", "'much'", "method.loss.l1"]),
+        ("ablation", "# @package _global_\nmethod:\n  lossy: 1\n", ["ablation/spoilt", "'lossy'"]),
+        ("experiment", "# @package _global_\nsede: 3\n", ["experiment/spoilt", "'sede'", "Did you mean seed"]),
+        ("scene", "name: x\npath: y\nlong_side: wide\n", ["scene/spoilt", "'wide'", "scene.long_side"]),
+    ],
+)
+def test_a_mistake_in_a_file_names_file_and_key(conf_copy, group, content, expected):
+    (conf_copy / group).mkdir(exist_ok=True)
+    (conf_copy / group / "spoilt.yaml").write_text(content)
+    text = message(f"{group}=spoilt")
+    for part in expected:
+        assert part in text
+
+
+def test_a_missing_folder_of_photos_is_asked_for():
+    assert "scene.path is empty" in message("scene=capture")
+
+
+def test_key_order_and_spelling_in_a_file_do_not_matter(conf_copy):
+    method = yaml.safe_load((conf_copy / "method" / "2dgs.yaml").read_text())
+    method["optimizer"] = {"eps": 1e-15, "sh_dc": 2.5e-3}
+    turned = {key: method[key] for key in reversed(method)}
+    text = yaml.safe_dump(turned, sort_keys=False).replace("sh_dc: 0.0025", "sh_dc: 25.0e-4")
+    assert "25.0e-4" in text
+    (conf_copy / "method" / "turned.yaml").write_text(text)
+    plain, turned_config = (compose(["scene=fox", f"method={name}"])[0] for name in ("2dgs", "turned"))
+    assert fingerprint(plain.method) == fingerprint(turned_config.method)
+
+
+def test_interpolations_are_gone_after_conversion():
+    config, _ = compose(["preset=paper", "method=2dgs", "schedule.total=77"])
+    assert config.schedule == dataclasses.replace(config.method.paper_schedule, total=77)
+
+
+def test_the_paper_preset_takes_every_key_of_the_schedule():
+    listed = yaml.safe_load((conf_dir() / "preset" / "paper.yaml").read_text())["schedule"]
+    keys = [field.name for field in dataclasses.fields(ScheduleSettings)]
+    assert listed == {key: f"${{method.paper_schedule.{key}}}" for key in keys}
+
+
+@pytest.mark.parametrize(
+    ("path", "name"),
+    [
+        ("/data/my scene", "my_scene"),
+        ("/data/kitchen/images", "kitchen"),
+        ("/data/kitchen/sparse/0", "kitchen"),
+        ("embedded:room", "room"),
+        ("/", "scene"),
+    ],
+)
+def test_a_scene_is_named_after_its_folder(path, name):
+    assert derive_name(path) == name
+
+
+def test_the_whole_product_composes_and_no_ablation_is_idle():
+    """Method x preset x ablation on one scene, scene x preset with one method. A scene sets scene keys only (checked
+    below), which methods and ablations do not touch, so the two together cover the whole product."""
+    for method, preset in itertools.product(choices_of("method"), choices_of("preset")):
+        plain, _ = compose(["scene=fox", f"method={method}", f"preset={preset}"])
+        for ablation in ABLATIONS:
+            config, _ = compose(["scene=fox", f"method={method}", f"preset={preset}", f"ablation={ablation}"])
+            assert recipe(config) != recipe(plain), f"ablation {ablation} changes nothing in {method} {preset}"
+            assert config.scene == plain.scene
+            assert config.ablation.why
+    for scene, preset in itertools.product(SCENES, choices_of("preset")):
+        config, choices = compose([f"scene={scene}", f"preset={preset}"])
+        assert choices.scene == config.scene.name
+
+
+@pytest.mark.parametrize("experiment", choices_of("experiment"))
+def test_experiments_compose(experiment):
+    _, choices = compose([f"experiment={experiment}"])
+    assert choices.experiment == experiment
+
+
+@pytest.mark.parametrize("method", choices_of("method"))
+def test_a_method_sets_no_keys_but_its_own(method):
+    assert "@package" not in (conf_dir() / "method" / f"{method}.yaml").read_text()
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_a_scene_sets_no_keys_but_its_own(scene):
+    text = (conf_dir() / "scene" / f"{scene}.yaml").read_text()
+    assert "@package" not in text
+    assert {"name", "path"} <= set(yaml.safe_load(text))
+
+
+@pytest.mark.parametrize("ablation", ABLATIONS)
+def test_an_ablation_flips_one_to_three_keys_and_says_why(ablation):
+    content = yaml.safe_load((conf_dir() / "ablation" / f"{ablation}.yaml").read_text())
+    why = content.pop("ablation")["why"]
+    assert why.strip()
+    assert "\n" not in why.strip()
+
+    def leaves(value: object) -> int:
+        return sum(map(leaves, value.values())) if isinstance(value, dict) else 1
+
+    assert 1 <= leaves(content) <= 3
