@@ -54,7 +54,7 @@ RULES: dict[str, SurfelTensors] = {
     "ties by row": join(surfel((*OFF, 2.0), opacity=0.5), surfel((*OFF, 2.0), opacity=0.5, features=(-1.0,))),
     "normal turned": join(surfel((*OFF, 2.0), tangent_u=(0, 1, 0.4), tangent_v=(1, 0, 0)), VISIBLE),
     "median": stacked(0.35, 4),
-    "alpha cut": surfel((*OFF, 2.0), opacity=2 / 255),
+    "alpha cut": join(surfel((*OFF, 2.0), opacity=2 / 255), VISIBLE),
     "below the opacity cut": join(surfel((*OFF, 2.0), opacity=0.9 / 255), VISIBLE),
     "behind": join(surfel((0.0, 0.0, -2.0), scales=(3, 3)), VISIBLE),
     "before near": join(surfel((0.0, 0.0, 0.15), scales=(3, 3)), VISIBLE),

@@ -36,7 +36,7 @@ def pool_examples(kind: str, examples: int, *, with_twin: bool = False) -> tuple
 
 
 def test_ordinary_scenes(isa: str):
-    pools, _ = pool_examples("ordinary", 40)
+    pools, _ = pool_examples("ordinary", 60)
     assert pools.pictures["alpha"].total > 5000
     assert pools.flagged_share < 0.1
     for name, pool in pools.pictures.items():
@@ -48,7 +48,7 @@ def test_ordinary_scenes(isa: str):
 
 @pytest.mark.parametrize("kind", DEGENERATE)
 def test_degenerate_scenes(isa: str, kind: str):
-    pools, twin = pool_examples(kind, 12, with_twin=True)
+    pools, twin = pool_examples(kind, 20, with_twin=True)
     assert pools.flagged_share < 0.5
     for name, pool in pools.pictures.items():
         allowed = max(PIXEL_SHARE, SLACK * twin.pictures[name].share_beyond(PIXEL_TOLERANCE))
