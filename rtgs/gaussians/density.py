@@ -1,0 +1,261 @@
+"""Density control: where surfels are cloned, split and pruned, and how a change of N reaches everything that has rows.
+
+The rules are those of 2DGS and EnvGS (methods.md 6.1, 12). Each surfel meets at most one of them in a call, in this
+order: transparent -> pruned; too large -> pruned or split into 5; high signal and large -> split into 2; high signal
+and small -> cloned. The cap on N comes last.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from rtgs.gaussians.surfels import LOG_SCALE_LIMIT, Surfels, tangents
+from rtgs.train.adam import SurfelAdam
+from rtgs.train.settings import DensitySettings
+
+
+@dataclass(frozen=True)
+class DensityReport:
+    """What one call did, in surfels."""
+
+    cloned: int  # surfels that got a copy
+    split: int  # surfels replaced by children
+    pruned: int  # surfels removed without children, those of the cap included
+    total: int  # N afterwards
+
+
+@dataclass(frozen=True)
+class RowPlan:
+    """A change of N: rows ``keep`` of the old surfels in this order, then the rows of ``added``."""
+
+    keep: Tensor  # (M,) int64
+    added: Surfels  # raw parameters of new surfels, no gradient
+
+
+class HasRows(Protocol):
+    """Anything with one row a surfel: an optimiser's moments, statistics."""
+
+    def keep(self, index: Tensor) -> None: ...
+
+    def append(self, count: int) -> None: ...
+
+
+def apply_plan(plan: RowPlan, surfels: Surfels, *followers: HasRows) -> None:
+    """Change N of the surfels (in place: new leaf tensors, gradients dropped) and of all that has a row for each.
+
+    The only way N ever changes, so that parameters, moments and statistics cannot get out of step. Followers give new
+    rows zeros.
+    """
+    added = dict(plan.added.items())
+    for name, values in surfels.items():
+        merged = torch.cat((values.detach()[plan.keep], added[name].detach()))
+        setattr(surfels, name, merged.requires_grad_(values.requires_grad))
+    for follower in followers:
+        follower.keep(plan.keep)
+        follower.append(len(plan.added))
+
+
+def select_rows(surfels: Surfels, index: Tensor) -> Surfels:
+    """A copy of rows ``index`` (int64 or bool), without gradient."""
+    return type(surfels)(**{name: values.detach()[index] for name, values in surfels.items()})
+
+
+def split_surfels(surfels: Surfels, count: int, shrink: float, generator: torch.Generator) -> Surfels:
+    """``count`` children of each surfel, drawn from its Gaussian in its own plane, with scales divided by ``shrink``.
+
+    Returns:
+        N * count surfels; the children of one parent are neighbours. All else is inherited.
+    """
+    children = select_rows(surfels, torch.arange(len(surfels)).repeat_interleave(count))
+    tangent_u, tangent_v = tangents(children.quaternions)
+    scales = children.log_scales.clamp(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT).exp()
+    offset = scales * torch.randn(len(children), 2, generator=generator)
+    children.means = children.means + offset[:, :1] * tangent_u + offset[:, 1:] * tangent_v
+    children.log_scales = children.log_scales - math.log(shrink)
+    return children
+
+
+class DensityControl:
+    """Statistics of the steps since the last change of N, and the rules that use them.
+
+    A surfel is visible in a step if its weight sum is positive or its signal is not zero; means are over those steps.
+    """
+
+    def __init__(self, settings: DensitySettings, extent: float) -> None:
+        """``extent`` of the scene in world units, which the size thresholds are relative to."""
+        if not (math.isfinite(extent) and extent > 0):
+            raise ValueError(f"scene extent {extent} must be positive; are all training cameras at one place?")
+        for name in ("min_opacity", "reset_opacity"):
+            if not 0 < getattr(settings, name) < 1:
+                raise ValueError(f"density.{name} {getattr(settings, name)} must be between 0 and 1")
+        if settings.split_shrink <= 0 or settings.too_large_shrink <= 0:
+            raise ValueError("density.split_shrink and density.too_large_shrink must be positive")
+        self.settings = settings
+        self.extent = extent
+        self._clear(0)
+
+    def _clear(self, count: int) -> None:  # 0: as many as the next step observes
+        self.signal_sum = torch.zeros(count)
+        self.weight_sum = torch.zeros(count)
+        self.visible_steps = torch.zeros(count, dtype=torch.int64)
+
+    def observe(self, signal: Tensor, weight_sum: Tensor) -> None:
+        """Record one step, after its backward pass.
+
+        Args:
+            signal: (N, 2) densification signal, NDC units (docs/rasterizer.md).
+            weight_sum: (N,) sum of blending weights over the pixels of the view.
+
+        Raises:
+            ValueError: N changed without :func:`apply_plan`, or shapes do not match.
+            FloatingPointError: a value is NaN or inf.
+        """
+        count = len(signal)
+        if signal.shape != (count, 2) or weight_sum.shape != (count,):
+            raise ValueError(
+                f"signal must be (N, 2) and weight_sum (N,), got {tuple(signal.shape)} and {tuple(weight_sum.shape)}"
+            )
+        if not len(self.visible_steps):
+            self._clear(count)
+        if len(self.visible_steps) != count:
+            raise ValueError(
+                f"{count} surfels observed, but the statistics are of {len(self.visible_steps)}; "
+                "change N through rtgs.gaussians.density.apply_plan"
+            )
+        norm = signal.detach().norm(dim=1)
+        weight = weight_sum.detach()
+        if not torch.isfinite(norm + weight).all():
+            bad = (~torch.isfinite(norm + weight)).nonzero().flatten()
+            raise FloatingPointError(
+                f"densification signal or weight sum of {len(bad)} surfels is NaN or inf (first ids {bad[:8].tolist()})"
+            )
+        self.signal_sum += norm
+        self.weight_sum += weight
+        self.visible_steps += (weight > 0) | (norm > 0)
+
+    @property
+    def mean_signal(self) -> Tensor:
+        """(N,) mean norm of the signal over the steps a surfel was visible in; 0 if none."""
+        return self.signal_sum / self.visible_steps.clamp_min(1)
+
+    @property
+    def mean_weight(self) -> Tensor:
+        """(N,) mean weight sum over the steps a surfel was visible in; 0 if none."""
+        return self.weight_sum / self.visible_steps.clamp_min(1)
+
+    @torch.no_grad()
+    def densify(self, surfels: Surfels, optimizer: SurfelAdam, generator: torch.Generator) -> DensityReport:
+        """Clone, split and prune; the statistics start afresh. Without an observed step only pruning and splitting by
+        opacity and size happen."""
+        if not len(self.visible_steps):
+            self._clear(len(surfels))
+        s = self.settings
+        size = surfels.log_scales.detach().exp().amax(dim=1)
+        high_signal = (self.visible_steps > 0) & (self.mean_signal >= s.gradient_threshold)
+        transparent = surfels.opacity_logits.detach() < logit(s.min_opacity)
+        too_large = (
+            ~transparent & (size > s.too_large * self.extent) if s.too_large > 0 else torch.zeros_like(transparent)
+        )
+        too_large_pruned = too_large & self._lowest_weights(s.low_weight_share)
+        too_large_split = too_large & ~too_large_pruned
+        rest = high_signal & ~transparent & ~too_large
+        split = rest & (size > s.size_border * self.extent)
+        clone = rest & ~split
+
+        keep = (~(transparent | too_large | split)).nonzero().flatten()
+        parts = (
+            select_rows(surfels, clone),
+            split_surfels(select_rows(surfels, split), s.split_count, s.split_shrink, generator),
+            split_surfels(
+                select_rows(surfels, too_large_split), s.too_large_split_count, s.too_large_shrink, generator
+            ),
+        )
+        weight = self.mean_weight
+        weights = torch.cat(
+            (
+                weight[keep],
+                weight[clone],
+                weight[split].repeat_interleave(s.split_count),
+                weight[too_large_split].repeat_interleave(s.too_large_split_count),
+            )
+        )
+        plan, capped = self._capped(RowPlan(keep, concatenate(parts)), weights)
+        apply_plan(plan, surfels, optimizer, self)
+        self._clear(0)
+        return DensityReport(
+            cloned=int(clone.sum()),
+            split=int(split.sum() + too_large_split.sum()),
+            pruned=int(transparent.sum() + too_large_pruned.sum()) + capped,
+            total=len(surfels),
+        )
+
+    def _lowest_weights(self, share: float) -> Tensor:
+        """(N,) bool: mean weight below that quantile (as in EnvGS: where that many are 0, none is below)."""
+        weight = self.mean_weight
+        return weight < weight.quantile(share) if len(weight) else torch.zeros(0, dtype=torch.bool)
+
+    def _capped(self, plan: RowPlan, weights: Tensor) -> tuple[RowPlan, int]:
+        """The plan without the rows of lowest weight above the cap, and how many (children weigh as the parent)."""
+        excess = len(weights) - int(self.settings.cap_share * self.settings.max_surfels)
+        if excess <= 0:
+            return plan, 0
+        stays = torch.ones(len(weights), dtype=torch.bool)
+        stays[weights.argsort(stable=True)[:excess]] = False
+        kept = len(plan.keep)
+        return RowPlan(plan.keep[stays[:kept]], select_rows(plan.added, stays[kept:])), excess
+
+    @torch.no_grad()
+    def reset_opacity(self, surfels: Surfels, optimizer: SurfelAdam) -> None:
+        """Opacity becomes min(opacity, ``settings.reset_opacity``); its moments become 0."""
+        surfels.opacity_logits.clamp_(max=logit(self.settings.reset_opacity))
+        optimizer.zero_moments("opacity_logits")
+
+    def keep(self, index: Tensor) -> None:
+        """Rows ``index`` become the new rows (see :func:`apply_plan`)."""
+        if not len(self.visible_steps):  # nothing observed since the last change: zeros for any N
+            return
+        self.signal_sum = self.signal_sum[index]
+        self.weight_sum = self.weight_sum[index]
+        self.visible_steps = self.visible_steps[index]
+
+    def append(self, count: int) -> None:
+        """``count`` rows of zeros at the end (see :func:`apply_plan`)."""
+        if not len(self.visible_steps):
+            return
+        self.signal_sum = torch.cat((self.signal_sum, self.signal_sum.new_zeros(count)))
+        self.weight_sum = torch.cat((self.weight_sum, self.weight_sum.new_zeros(count)))
+        self.visible_steps = torch.cat((self.visible_steps, self.visible_steps.new_zeros(count)))
+
+    def state(self) -> dict[str, Tensor]:
+        """All that a checkpoint needs (the live tensors, not copies)."""
+        return {"signal_sum": self.signal_sum, "weight_sum": self.weight_sum, "visible_steps": self.visible_steps}
+
+    def load(self, state: dict[str, Tensor]) -> None:
+        """Take over a :meth:`state` (copied).
+
+        Raises:
+            ValueError: an entry is missing, or lengths differ.
+        """
+        if missing := sorted(self.state().keys() - state.keys()):
+            raise ValueError(f"density state lacks {', '.join(missing)}; the checkpoint is incomplete")
+        lengths = {name: tuple(state[name].shape) for name in self.state()}
+        if len(set(lengths.values())) != 1:
+            raise ValueError(f"density state has rows of different number: {lengths}")
+        self.signal_sum = state["signal_sum"].detach().float().clone()
+        self.weight_sum = state["weight_sum"].detach().float().clone()
+        self.visible_steps = state["visible_steps"].detach().long().clone()
+
+
+def concatenate(parts: tuple[Surfels, ...]) -> Surfels:
+    """The rows of all parts, in order."""
+    return type(parts[0])(**{name: torch.cat([getattr(p, name) for p in parts]) for name, _ in parts[0].items()})
+
+
+def logit(opacity: float) -> float:
+    """The raw value of an opacity in (0, 1)."""
+    return math.log(opacity / (1 - opacity))

@@ -1,0 +1,109 @@
+"""Initial surfels: from a point cloud, or from random points in a box (methods.md section 2)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from rtgs.gaussians.harmonics import rest_count, rgb_to_sh_dc
+from rtgs.gaussians.surfels import Surfels
+from rtgs.train.settings import InitSettings
+
+SMALLEST_SQUARED_DISTANCE = 1e-7  # world units squared: the scale of duplicate points
+BOX_QUANTILES = (0.005, 0.995)  # per axis: the scene box without far outliers (methods.md 6.1)
+
+
+def surfels_from_points(
+    points: Tensor,
+    colors: Tensor,
+    settings: InitSettings,
+    generator: torch.Generator,
+    *,
+    box: Tensor | None = None,
+) -> Surfels:
+    """One surfel for each point: scale from its neighbours, random orientation, colour from the point.
+
+    Points with a NaN or inf coordinate are left out. With ``settings.random_points`` > 0 the points are replaced by
+    that many uniform random ones of random colour in ``box``, or else in the box of the points.
+
+    Args:
+        points: (P, 3) world.
+        colors: (P, 3) in 0..1.
+        generator: draws the orientations (and the random points).
+        box: (2, 3) lowest and highest corner, world; only for random points.
+
+    Returns:
+        Surfels that require gradients, float32.
+
+    Raises:
+        ValueError: shapes do not match, or there are fewer usable points than ``settings.min_points``.
+    """
+    if points.ndim != 2 or points.shape[1] != 3 or colors.shape != points.shape:
+        raise ValueError(f"points and colors must both be (P, 3), got {tuple(points.shape)} and {tuple(colors.shape)}")
+    if not 0 < settings.opacity < 1:
+        raise ValueError(f"init.opacity {settings.opacity} must be between 0 and 1")
+    usable = torch.isfinite(points).all(dim=1) & torch.isfinite(colors).all(dim=1)
+    points, colors = points[usable].float(), colors[usable].float().clamp(0, 1)
+    if settings.random_points > 0:
+        if box is None:
+            box = points_box(points)
+        points, colors = random_points(settings.random_points, box, generator)
+    elif len(points) < settings.min_points:
+        raise ValueError(
+            f"only {len(points)} of {len(usable)} points are usable, but init.min_points is {settings.min_points}: "
+            "check the reconstruction (are the images registered?), or ask for random points: init.random_points=20000"
+        )
+    count = len(points)
+    scale = neighbor_distance(points, settings.neighbors)
+    quaternions = torch.rand(count, 4, generator=generator)
+    return Surfels(
+        means=points.clone().contiguous(),
+        log_scales=scale.log()[:, None].repeat(1, 2),
+        quaternions=quaternions,
+        opacity_logits=torch.full((count,), math.log(settings.opacity / (1 - settings.opacity))),
+        sh_dc=rgb_to_sh_dc(colors),
+        sh_rest=torch.zeros(count, rest_count(settings.sh_degree), 3),
+    ).requires_grad_()
+
+
+def neighbor_distance(points: Tensor, neighbors: int) -> Tensor:
+    """(P,) root mean squared distance to the nearest ``neighbors`` other points, world units, at least sqrt(1e-7).
+
+    With fewer other points than that, to all of them; a single point gets the floor.
+    """
+    if neighbors < 1:
+        raise ValueError(f"init.neighbors {neighbors} must be at least 1")
+    count = min(neighbors, len(points) - 1)
+    if count < 1:
+        return torch.full((len(points),), math.sqrt(SMALLEST_SQUARED_DISTANCE))
+    coordinates = points.double().numpy()
+    distance, _ = cKDTree(coordinates).query(coordinates, k=count + 1, workers=torch.get_num_threads())
+    squared = np.square(distance[:, 1:]).mean(axis=1)  # column 0 is the point itself (or its duplicate, also at 0)
+    return torch.from_numpy(np.sqrt(np.maximum(squared, SMALLEST_SQUARED_DISTANCE))).float()
+
+
+def points_box(points: Tensor) -> Tensor:
+    """(2, 3) corners of the per-axis 0.5 to 99.5 percentile range of (P, 3) points, world.
+
+    Raises:
+        ValueError: no point, or all at one place.
+    """
+    if not len(points):
+        raise ValueError("there are no points to take the scene box from; give the box of the random points")
+    box = torch.from_numpy(np.quantile(points.double().numpy(), BOX_QUANTILES, axis=0)).float()
+    if not (box[1] > box[0]).any():
+        raise ValueError(f"all {len(points)} points are at {points[0].tolist()}; give the box of the random points")
+    return box
+
+
+def random_points(count: int, box: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Uniform points (count, 3) in a box (2, 3), world, and uniform colours (count, 3) in 0..1."""
+    low, high = box.float()
+    if not (torch.isfinite(box).all() and (high >= low).all()):
+        raise ValueError(f"the box of the random points {box.tolist()} must be finite, low corner first")
+    points = low + (high - low) * torch.rand(count, 3, generator=generator)
+    return points, torch.rand(count, 3, generator=generator)
