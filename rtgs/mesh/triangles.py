@@ -1,0 +1,92 @@
+"""A triangle mesh and its files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from rtgs.errors import RtgsError
+
+
+@dataclass(frozen=True)
+class TriangleMesh:
+    """V vertices, F triangles, world frame; counter-clockwise seen from outside."""
+
+    vertices: np.ndarray  # (V, 3) float32
+    faces: np.ndarray  # (F, 3) int32
+    colors: np.ndarray | None = None  # (V, 3) float32 in [0, 1]
+
+    def __post_init__(self) -> None:
+        vertices, faces = np.asarray(self.vertices, np.float32), np.asarray(self.faces, np.int32)
+        if vertices.ndim != 2 or vertices.shape[1:] != (3,) or faces.ndim != 2 or faces.shape[1:] != (3,):
+            raise ValueError(f"mesh takes vertices (V, 3) and faces (F, 3), got {vertices.shape} and {faces.shape}")
+        if not np.isfinite(vertices).all():
+            raise ValueError("mesh vertices hold NaN or inf")
+        if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
+            raise ValueError(f"mesh faces point to vertices {faces.min()} to {faces.max()}, there are {len(vertices)}")
+        if self.colors is not None and np.shape(self.colors) != vertices.shape:
+            raise ValueError(f"mesh colours have shape {np.shape(self.colors)}, expected {vertices.shape}")
+        object.__setattr__(self, "vertices", np.ascontiguousarray(vertices))
+        object.__setattr__(self, "faces", np.ascontiguousarray(faces))
+
+    def face_normals(self) -> np.ndarray:
+        """(F, 3) float64 outward normals, twice the area long."""
+        a, b, c = (self.vertices[self.faces[:, k]].astype(np.float64) for k in range(3))
+        return np.cross(b - a, c - a)
+
+
+def write_mesh_ply(path: Path, mesh: TriangleMesh) -> None:
+    """Binary PLY with vertices, 8-bit colours if there are any, and triangles."""
+    from plyfile import PlyData, PlyElement
+
+    fields = [("x", "f4"), ("y", "f4"), ("z", "f4")]
+    if mesh.colors is not None:
+        fields += [("red", "u1"), ("green", "u1"), ("blue", "u1")]
+    vertices = np.empty(len(mesh.vertices), dtype=fields)
+    for k, name in enumerate("xyz"):
+        vertices[name] = mesh.vertices[:, k]
+    if mesh.colors is not None:
+        for k, name in enumerate(("red", "green", "blue")):
+            vertices[name] = np.rint(np.clip(mesh.colors[:, k], 0, 1) * 255)
+    faces = np.empty(len(mesh.faces), dtype=[("vertex_indices", "i4", (3,))])
+    faces["vertex_indices"] = mesh.faces
+    path.parent.mkdir(parents=True, exist_ok=True)
+    PlyData([PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]).write(str(path))
+
+
+def read_mesh_ply(path: Path) -> TriangleMesh:
+    """A triangle mesh from a PLY file.
+
+    Raises:
+        RtgsError: not a readable PLY, no faces (a point cloud), or faces that are not triangles.
+    """
+    from plyfile import PlyData, PlyParseError
+
+    try:
+        data = PlyData.read(str(path))
+    except (PlyParseError, OSError, ValueError) as error:
+        raise RtgsError(f"{path} is not a readable PLY: {error}") from error
+    names = {element.name for element in data.elements}
+    if "vertex" not in names or "face" not in names:
+        raise RtgsError(f"{path} has elements {sorted(names)}, a mesh needs vertex and face; is it a point cloud?")
+    vertex, face = data["vertex"], data["face"]
+    vertices = np.stack([np.asarray(vertex[name], np.float32) for name in "xyz"], axis=1)
+    rows = list(face[face.properties[0].name])
+    if any(len(row) != 3 for row in rows):
+        raise RtgsError(f"{path} holds faces with other than three corners; triangulate it first")
+    faces = np.array(rows, np.int32).reshape(-1, 3)
+    colors = None
+    if {"red", "green", "blue"} <= {item.name for item in vertex.properties}:
+        colors = np.stack([np.asarray(vertex[name], np.float32) / 255 for name in ("red", "green", "blue")], axis=1)
+    return TriangleMesh(vertices, faces, colors)
+
+
+def write_mesh_obj(path: Path, mesh: TriangleMesh) -> None:
+    """Wavefront OBJ; colours follow the coordinates, as most viewers read them."""
+    columns = mesh.vertices if mesh.colors is None else np.concatenate([mesh.vertices, mesh.colors], axis=1)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", encoding="ascii") as stream:
+        np.savetxt(stream, columns, fmt="v" + " %.7g" * columns.shape[1])
+        np.savetxt(stream, mesh.faces + 1, fmt="f %d %d %d")

@@ -1,0 +1,272 @@
+"""Fusion of rendered depths into a triangle mesh (methods.md 6.3; the recipe of 2DGS).
+
+A truncated signed distance field in sparse voxel blocks (Open3D's VoxelBlockGrid), integrated view by view, then
+marching cubes and removal of small pieces.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rtgs.cameras import Camera
+from rtgs.errors import RtgsError
+from rtgs.mesh.triangles import TriangleMesh
+
+BLOCK = 8  # voxels along the side of a block
+FIRST_BLOCKS = 4096  # room reserved at the start; it grows
+
+
+@dataclass(frozen=True)
+class TsdfSettings:
+    """Numbers of the fusion. Lengths in world units; 0 means derived, as its comment says."""
+
+    depth_trunc: float = 0.0  # depths beyond it are ignored; 0: depth_trunc_radii * radius of the cameras
+    depth_trunc_radii: float = 2.0  # 2DGS bounded mode
+    voxel: float = 0.0  # 0: depth_trunc / resolution
+    resolution: int = 1024  # 2DGS
+    truncation_voxels: float = 5.0  # 2DGS
+    min_alpha: float = 0.5  # depths of pixels with less alpha are ignored (2DGS, its mask rule)
+    min_weight: float = 1.0  # observations a voxel needs to carry surface; 2DGS takes any
+    keep_clusters: int = 50  # largest connected pieces that stay (2DGS); 0: all
+    min_triangles: int = 50  # pieces with fewer go in any case (2DGS)
+    max_blocks: int = 400_000  # of 8^3 voxels, about 4 GB; beyond it the fusion stops with an error
+
+
+@dataclass(frozen=True)
+class DepthView:
+    """The rendered depth of one view."""
+
+    camera: Camera
+    depth: Tensor  # (H, W) z-depth of the surface, world units (divided by alpha); 0 or less: nothing there
+    image: Tensor | None = None  # (3, H, W) in [0, 1], colours of the mesh
+    alpha: Tensor | None = None  # (H, W)
+    mask: Tensor | None = None  # (H, W) bool: only these pixels are fused
+
+
+@dataclass(frozen=True)
+class FocusRegion:
+    """What a set of cameras looks at."""
+
+    center: np.ndarray  # (3,) the point nearest to all optical axes in the least-squares sense
+    radius: float  # smallest distance of a camera to it
+
+
+@dataclass(frozen=True)
+class MeshResult:
+    """A fused mesh and how it came about."""
+
+    mesh: TriangleMesh
+    voxel: float
+    depth_trunc: float
+    clusters: int  # connected pieces before the small ones went
+    kept: int
+
+
+def focus_region(cameras: Sequence[Camera]) -> FocusRegion:
+    """Least-squares focus point of the optical axes and the distance of the nearest camera (2DGS's bounding radius).
+
+    Parallel axes have no focus point; the smallest solution is taken, so the radius is that of the camera nearest to
+    the mean's foot point.
+    """
+    if not cameras:
+        raise RtgsError("no cameras, so no focus region: the scene has no training views")
+    centers = np.stack([camera.center.numpy() for camera in cameras])
+    axes = np.stack([camera.rotation[2].numpy() for camera in cameras])
+    projectors = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    mean = centers.mean(0)  # solved about the mean: with parallel axes the solution stays near the cameras
+    right = np.einsum("nij,nj->i", projectors, centers - mean)
+    center = mean + np.linalg.lstsq(projectors.sum(0), right, rcond=1e-9)[0]
+    return FocusRegion(center, float(np.linalg.norm(centers - center, axis=1).min()))
+
+
+def fuse_depths(views: Sequence[DepthView], settings: TsdfSettings = TsdfSettings()) -> MeshResult:
+    """Fuse the views and extract the mesh.
+
+    Raises:
+        RtgsError: no views, no usable depth, more blocks than ``max_blocks``, no surface left, or Open3D's system
+            library is missing.
+    """
+    depth_trunc, voxel = fusion_lengths([view.camera for view in views], settings)
+    open3d = import_open3d()
+    core = open3d.core
+    with_color = all(view.image is not None for view in views)
+    names, types, shapes = ["tsdf", "weight"], [core.float32] * 2, [(1), (1)]
+    if with_color:
+        names, types, shapes = [*names, "color"], [*types, core.float32], [*shapes, (3)]
+    grid = open3d.t.geometry.VoxelBlockGrid(tuple(names), tuple(types), tuple(shapes), voxel, BLOCK, FIRST_BLOCKS)
+    touched = 0
+    for view in views:
+        depth = usable_depth(view, depth_trunc, settings.min_alpha)
+        blocks = blocks_near_surface(view.camera, depth, voxel, settings.truncation_voxels)
+        if len(blocks):
+            touched += len(blocks)
+            _integrate(open3d, grid, view, depth, blocks, depth_trunc, settings.truncation_voxels, with_color)
+        allocated = int(grid.hashmap().size())
+        if allocated > settings.max_blocks:
+            raise RtgsError(
+                f"the mesh grid reached {allocated} blocks of {BLOCK}^3 voxels, max_blocks is {settings.max_blocks}: "
+                f"raise the voxel (now {voxel:g}) or lower depth_trunc (now {depth_trunc:g})"
+            )
+    if touched == 0:
+        raise RtgsError(
+            f"none of the {len(views)} views has a depth in (0, {depth_trunc:g}] with alpha >= {settings.min_alpha:g}"
+            " (inside the masks, where given): nothing to fuse"
+        )
+    return _extract(grid, settings, voxel, depth_trunc, with_color)
+
+
+def fusion_lengths(cameras: Sequence[Camera], settings: TsdfSettings) -> tuple[float, float]:
+    """(depth_trunc, voxel) in world units, derived where the settings say 0."""
+    depth_trunc = settings.depth_trunc or settings.depth_trunc_radii * focus_region(cameras).radius
+    voxel = settings.voxel or depth_trunc / settings.resolution
+    if not (0 < voxel < depth_trunc < float("inf")):
+        raise RtgsError(
+            f"mesh: voxel {voxel:g} and depth_trunc {depth_trunc:g} must satisfy 0 < voxel < depth_trunc; "
+            "set mesh.depth_trunc and mesh.voxel by hand (cameras at one point have no bounding radius)"
+        )
+    return depth_trunc, voxel
+
+
+def usable_depth(view: DepthView, depth_trunc: float, min_alpha: float) -> np.ndarray:
+    """(H, W) float32 depth with 0 where the view shows nothing that should be fused."""
+    depth = view.depth.detach().float()
+    camera = view.camera
+    if depth.shape != (camera.height, camera.width):
+        raise ValueError(
+            f"view {camera.name!r}: depth is {tuple(depth.shape)}, the camera is {camera.height} x {camera.width}"
+        )
+    keep = torch.isfinite(depth) & (depth > 0) & (depth <= depth_trunc)
+    if view.alpha is not None:
+        keep &= view.alpha >= min_alpha
+    if view.mask is not None:
+        keep &= view.mask
+    return torch.where(keep, depth, 0.0).contiguous().numpy()
+
+
+def blocks_near_surface(camera: Camera, depth: np.ndarray, voxel: float, truncation_voxels: float) -> np.ndarray:
+    """(B, 3) int32 indices of the blocks within the truncation distance of the observed surface along its rays.
+
+    Every pixel is used (Open3D's own search takes every fourth, which leaves holes when a block is smaller than four
+    pixels' footprint).
+    """
+    rows, columns = np.nonzero(depth)
+    if len(rows) == 0:
+        return np.empty((0, 3), np.int32)
+    rays = camera.rays(torch.float64)
+    directions = rays.directions.numpy()[rows, columns]
+    side, truncation = BLOCK * voxel, truncation_voxels * voxel
+    # Steps of at most half a block along the most oblique ray; an odd number, so that the surface itself is among them.
+    longest = float(np.linalg.norm(directions, axis=1).max())
+    steps = 2 * int(np.ceil(2 * truncation * longest / side)) + 1
+    found = []
+    for offset in np.linspace(-truncation, truncation, steps):
+        z = np.maximum(depth[rows, columns] + offset, 0.0)
+        indices = np.floor((rays.origin.numpy() + z[:, None] * directions) / side).astype(np.int64)
+        found.append(np.unique(_packed(indices)))
+    return _unpacked(np.unique(np.concatenate(found)))
+
+
+_KEY_BITS = 21  # of each coordinate of a block index; sorting one integer is many times faster than sorting rows
+
+
+def _packed(indices: np.ndarray) -> np.ndarray:
+    """(B, 3) block indices as one int64 each."""
+    limit = 1 << (_KEY_BITS - 1)
+    if np.abs(indices).max() >= limit:
+        raise RtgsError(
+            f"the mesh reaches {np.abs(indices).max()} blocks of {BLOCK} voxels from the world's origin, at most "
+            f"{limit} are possible: raise the voxel, or move the scene to the origin"
+        )
+    shifted = indices + limit
+    return (shifted[:, 0] << (2 * _KEY_BITS)) | (shifted[:, 1] << _KEY_BITS) | shifted[:, 2]
+
+
+def _unpacked(keys: np.ndarray) -> np.ndarray:
+    """Inverse of :func:`_packed`, int32."""
+    limit, field = 1 << (_KEY_BITS - 1), (1 << _KEY_BITS) - 1
+    parts = [keys >> (2 * _KEY_BITS), (keys >> _KEY_BITS) & field, keys & field]
+    return (np.stack(parts, axis=1) - limit).astype(np.int32)
+
+
+def import_open3d() -> ModuleType:
+    """Open3D, imported when it is needed.
+
+    Raises:
+        RtgsError: it does not load, most often for want of libusb.
+    """
+    try:
+        import open3d
+    except (ImportError, OSError) as error:
+        hint = (
+            "install libusb-1.0-0 (Debian/Ubuntu: apt install libusb-1.0-0)"
+            if "libusb" in str(error)
+            else ("run `make setup` again")
+        )
+        raise RtgsError(f"mesh extraction needs Open3D, which does not load: {error}; {hint}") from error
+    return open3d
+
+
+def _integrate(
+    open3d: ModuleType,
+    grid: Any,
+    view: DepthView,
+    depth: np.ndarray,
+    blocks: np.ndarray,
+    depth_trunc: float,
+    truncation_voxels: float,
+    with_color: bool,
+) -> None:
+    """Add one view. Open3D truncates pixel coordinates to integers: pixel edges at integers, as in our cameras."""
+    camera = view.camera
+    intrinsic = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
+    extrinsic = np.eye(4)
+    extrinsic[:3, :3], extrinsic[:3, 3] = camera.rotation.numpy(), camera.translation.numpy()
+    images = [open3d.t.geometry.Image(depth)]
+    if with_color and view.image is not None:
+        pixels = view.image.detach().float().clamp(0, 1).permute(1, 2, 0).contiguous().numpy()
+        images.append(open3d.t.geometry.Image(pixels))
+    matrices = open3d.core.Tensor(intrinsic), open3d.core.Tensor(extrinsic)
+    grid.integrate(open3d.core.Tensor(blocks), *images, *matrices, 1.0, depth_trunc, truncation_voxels)
+
+
+def _extract(grid: Any, settings: TsdfSettings, voxel: float, depth_trunc: float, with_color: bool) -> MeshResult:
+    """Marching cubes, then the largest pieces."""
+    extracted = grid.extract_triangle_mesh(weight_threshold=settings.min_weight)
+    vertices = extracted.vertex.positions.numpy() if "positions" in extracted.vertex else np.empty((0, 3), np.float32)
+    faces = extracted.triangle.indices.numpy() if "indices" in extracted.triangle else np.empty((0, 3), np.int32)
+    colors = np.clip(extracted.vertex.colors.numpy(), 0, 1) if with_color and len(vertices) else None
+    mesh, clusters, kept = largest_pieces(
+        TriangleMesh(vertices, faces, colors), settings.keep_clusters, settings.min_triangles
+    )
+    if len(mesh.faces) == 0:
+        raise RtgsError(
+            f"the fused mesh has no piece of {settings.min_triangles} triangles ({clusters} smaller ones): "
+            f"the depths do not agree at a voxel of {voxel:g}, or the voxel is too coarse for the object"
+        )
+    return MeshResult(mesh, voxel, depth_trunc, clusters, kept)
+
+
+def largest_pieces(mesh: TriangleMesh, keep: int, min_triangles: int) -> tuple[TriangleMesh, int, int]:
+    """The mesh without its small connected pieces; (mesh, pieces before, pieces kept). ``keep`` 0 keeps any number."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    count = len(mesh.vertices)
+    edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]]])
+    graph = coo_matrix((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(count, count))
+    _, labels = connected_components(graph, directed=False)
+    triangles = np.bincount(labels[mesh.faces[:, 0]], minlength=1) if len(mesh.faces) else np.zeros(1, np.int64)
+    pieces = np.flatnonzero(triangles)
+    order = pieces[np.argsort(-triangles[pieces], kind="stable")]
+    chosen = [piece for piece in order[: keep or None] if triangles[piece] >= min_triangles]
+    faces = mesh.faces[np.isin(labels[mesh.faces[:, 0]], chosen)]
+    used, renumbered = np.unique(faces, return_inverse=True)
+    colors = None if mesh.colors is None else mesh.colors[used]
+    return TriangleMesh(mesh.vertices[used], renumbered.reshape(-1, 3), colors), len(pieces), len(chosen)
