@@ -40,7 +40,7 @@ NAMES = tuple(f.name for f in fields(SurfelTensors))
 
 @dataclass(frozen=True)
 class Recipe:
-    """One test scene. ``kind`` is "ordinary" or a key of :data:`DEGENERATE`."""
+    """One test scene. ``kind`` is "ordinary" or a key of :data:`MODIFIERS`."""
 
     kind: str
     seed: int
@@ -70,7 +70,7 @@ def build(recipe: Recipe) -> SurfelScene:
     size = np.exp(rng.normal(np.log(0.12), 0.6, (n, 2))) * depth[:, None] / 3
     parts = _Parts(local, tangent_u, tangent_v, size, rng.uniform(0.05, 0.98, n))
     if recipe.kind != "ordinary":
-        parts = DEGENERATE[recipe.kind](rng, parts)
+        parts = MODIFIERS[recipe.kind](rng, parts)
     rotation, translation = camera.rotation.numpy(), camera.translation.numpy()
     means = (parts.local - translation) @ rotation
     background = torch.tensor(rng.uniform(0, 1, recipe.channels), dtype=torch.float32) if recipe.background else None
@@ -151,6 +151,11 @@ def _tangents(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndar
     return tangent_u, np.cross(normal, tangent_u)
 
 
+def _crowded(rng: np.random.Generator, parts: _Parts) -> _Parts:
+    """Larger and more opaque, so that pixels stop early."""
+    return replace(parts, scales=parts.scales * 3, opacities=rng.uniform(0.3, 0.98, len(parts.local)))
+
+
 def _edge_on(rng: np.random.Generator, parts: _Parts) -> _Parts:
     """Tangent v along the line of sight, off by 0 (exactly) to 0.1."""
     view = _unit(parts.local)
@@ -219,7 +224,8 @@ def _crossing(rng: np.random.Generator, parts: _Parts) -> _Parts:
     return replace(parts, local=local, scales=rng.uniform(0.3, 4.0, (n, 2)), opacities=rng.uniform(0.01, 0.6, n))
 
 
-DEGENERATE: dict[str, Callable[[np.random.Generator, _Parts], _Parts]] = {
+MODIFIERS: dict[str, Callable[[np.random.Generator, _Parts], _Parts]] = {
+    "crowded": _crowded,
     "edge-on": _edge_on,
     "needle": _needle,
     "huge": _huge,
@@ -229,3 +235,4 @@ DEGENERATE: dict[str, Callable[[np.random.Generator, _Parts], _Parts]] = {
     "behind": _behind,
     "crossing": _crossing,
 }
+DEGENERATE = tuple(kind for kind in MODIFIERS if kind != "crowded")

@@ -18,8 +18,8 @@ from rtgs.render.reference import rasterize_surfels as twin
 
 from .comparison import pixel_error, relative_error
 from .scenes import OUTPUTS, identity_camera, join, surfel
-from .strategies import NAMES, SurfelScene, SurfelTensors, wild
-from .twin_runs import answer, run
+from .strategies import NAMES, Recipe, SurfelScene, SurfelTensors, wild
+from .twin_runs import answer, expected, run
 
 OFF = (0.013, -0.021)  # world offset that keeps hand-made surfels off exact pixel centres
 
@@ -156,6 +156,20 @@ def test_nothing_is_nan_or_inf_for_any_finite_input(isa: str):
                 assert values.isfinite().all(), name
 
     draw()
+
+
+def test_the_number_of_threads_does_not_change_a_bit(isa: str):
+    answered = expected(Recipe("crowded", 7, 150, 49, 35, 12))
+    runs = []
+    for threads in (1, 2, 3):
+        torch.set_num_threads(threads)
+        runs.append(run(rasterize_surfels, answered.scene, torch.float32, answered.upstream))
+    for other in runs[1:]:
+        for name, picture in runs[0].pictures.items():
+            assert torch.equal(other.pictures[name], picture), name
+        for name, gradient in runs[0].gradients.items():
+            assert torch.equal(other.gradients[name], gradient), name
+        assert torch.equal(other.weight_sum, runs[0].weight_sum)
 
 
 def test_gradients_of_culled_rows_are_zero(isa: str):

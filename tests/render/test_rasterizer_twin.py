@@ -57,6 +57,19 @@ def test_degenerate_scenes(isa: str, kind: str):
         assert pool.worst <= max(GRADIENT_TOLERANCE, SLACK * twin.gradients[name].worst), name
 
 
+def test_crowded_picture(isa: str):
+    """Many surfels per pixel over 4 x 3 tiles: long tile lists, and pixels that stop early."""
+    answer = expected(Recipe("crowded", 7, 150, 49, 35, 12))
+    assert (answer.exact.pictures["alpha"] > 1 - 1e-4).double().mean() > 0.2
+    pools = Pools()
+    pools.add(run(rasterize_surfels, answer.scene, torch.float32, answer.upstream), answer)
+    assert pools.flagged_share < 0.5
+    for name, pool in pools.pictures.items():
+        assert pool.share_beyond(PIXEL_TOLERANCE) <= PIXEL_SHARE, f"{name}: worst {pool.worst:.1e}"
+    for name, pool in pools.gradients.items():
+        assert pool.worst <= GRADIENT_TOLERANCE, name
+
+
 @pytest.mark.parametrize("channels", range(1, 33))
 def test_every_channel_count(isa: str, channels: int):
     answer = expected(Recipe("ordinary", 100 + channels, 12, 19, 17, channels))
