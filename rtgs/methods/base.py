@@ -57,7 +57,7 @@ class LossTerm:
     """One weighted term of the loss, for the log and for the guard."""
 
     name: str
-    value: Tensor  # scalar, detached, before the weight
+    value: float  # before the weight
     weight: float
 
 

@@ -14,7 +14,14 @@ from rtgs.methods.base import Decision, LossTerm, LossTerms, RenderedView, Rende
 from rtgs.methods.surfel_set import SurfelSet
 from rtgs.render.buffers import RasterBuffers, RasterOptions
 from rtgs.render.rasterize import rasterize_surfels
-from rtgs.train.losses import distortion_loss, mono_normal_loss, normal_consistency_loss, photometric_loss
+from rtgs.train.losses import (
+    distortion_loss,
+    inverse_depth_weights,
+    mono_normal_loss,
+    normal_consistency_loss,
+    photometric_loss,
+    surface_depth,
+)
 from rtgs.train.schedule import check_schedule, densify_due, loss_start, opacity_reset_due, sh_degree_at
 from rtgs.train.settings import MethodSettings, ScheduleSettings
 
@@ -77,12 +84,12 @@ class SurfelMethod:
 
     def training_options(self, step: int) -> RenderOptions:
         """The maps that the losses of this step need, and no others."""
-        normal = _on(self.starts.normal, step)
+        normal, mono = _on(self.starts.normal, step), _on(self.starts.mono_normal, step)
         ratio = self.settings.render.depth_ratio
         return RenderOptions(
-            depth=normal and ratio < 1,
+            depth=(normal and ratio < 1) or (mono and self.settings.loss.normal_inverse_depth),
             median_depth=normal and ratio > 0,
-            normal=normal or _on(self.starts.mono_normal, step),
+            normal=normal or mono,
             distortion=_on(self.starts.distortion, step),
         )
 
@@ -126,15 +133,6 @@ class SurfelMethod:
             weight_sum=weight_sum,
         )
 
-    def surface_depth(self, buffers: RasterBuffers) -> Tensor:
-        """(H, W) accumulated depth (sum of w z) of the surface: expected, median or a mix (``render.depth_ratio``)."""
-        ratio = self.settings.render.depth_ratio
-        if ratio == 0 and buffers.depth is not None:
-            return buffers.depth
-        assert buffers.median_depth is not None, "rendered without the median depth that depth_ratio > 0 needs"
-        median = buffers.median_depth * buffers.alpha.detach()
-        return median if buffers.depth is None else (1 - ratio) * buffers.depth + ratio * median
-
     def losses(self, rendered: RenderedView, view: View, step: int) -> LossTerms:
         """L1 and D-SSIM always; normal consistency, monocular normals, distortion as decided (methods.md 5)."""
         weights = self.settings.loss
@@ -146,30 +144,44 @@ class SurfelMethod:
         def add(name: str, value: Tensor, weight: float) -> None:
             nonlocal total
             total = total + weight * value
-            terms.append(LossTerm(name, value.detach(), weight))
+            terms.append(LossTerm(name, float(value.detach()), weight))
 
         if _on(self.starts.normal, step):
-            assert buffers.normal is not None
-            value = normal_consistency_loss(
-                buffers.normal,
-                self.surface_depth(buffers),
-                buffers.alpha,
-                rendered.camera,
-                inverse_depth_weight=weights.normal_inverse_depth,
-            )
-            add("normal", value, weights.normal)
+            add("normal", self._normal_consistency(buffers, rendered.camera), weights.normal)
         if _on(self.starts.mono_normal, step) and view.normal is not None:
-            assert buffers.normal is not None
-            value = mono_normal_loss(buffers.normal, view.normal, rendered.camera, form=weights.mono_normal_form)
-            add("mono_normal", value, weights.mono_normal)
+            add("mono_normal", self._mono_normal(buffers, view.normal, rendered.camera), weights.mono_normal)
         if _on(self.starts.distortion, step):
             assert buffers.distortion is not None
             add("distortion", distortion_loss(buffers.distortion), weights.distortion)
         return LossTerms(total, tuple(terms))
 
+    def _normal_consistency(self, buffers: RasterBuffers, camera: Camera) -> Tensor:
+        """L_norm with the surface depth that ``render.depth_ratio`` asks for."""
+        ratio = self.settings.render.depth_ratio
+        assert buffers.normal is not None
+        depth = buffers.alpha if buffers.depth is None else buffers.depth  # unused at ratio 1
+        return normal_consistency_loss(
+            buffers.normal,
+            depth,
+            buffers.alpha,
+            camera,
+            inverse_depth_weight=self.settings.loss.normal_inverse_depth,
+            depth_override=surface_depth(depth, buffers.alpha, buffers.median_depth, ratio) if ratio > 0 else None,
+        )
+
+    def _mono_normal(self, buffers: RasterBuffers, target: Tensor, camera: Camera) -> Tensor:
+        """L_mono, depth-weighted like L_norm (methods.md 5)."""
+        loss = self.settings.loss
+        assert buffers.normal is not None
+        weight = None
+        if loss.normal_inverse_depth:
+            assert buffers.depth is not None
+            weight = inverse_depth_weights(buffers.depth, buffers.alpha)
+        return mono_normal_loss(buffers.normal, target, camera, form=loss.mono_normal_form, weight=weight)
+
     def after_step(self, step: int) -> tuple[StepEvent, ...]:
         """Adam, then what the schedule asks of the base set before the next step."""
-        self.base.step(step)
+        self.base.step(step, self.sh_degree(step))
         following = step + 1
         events = []
         if densify_due(self.schedule, following):

@@ -43,12 +43,16 @@ class SurfelSet:
         self.surfels = surfels.requires_grad_()
         self.extent = extent
         self._optimizer_settings = optimizer
-        self.optimizer = SurfelAdam(self.surfels, optimizer, extent, means_lr_steps)
+        self._means_lr_steps = means_lr_steps
+        self.optimizer = self._new_optimizer()
         self.density = DensityControl(density, extent)
         self._observation: Observation | None = None
 
     def __len__(self) -> int:
         return len(self.surfels)
+
+    def _new_optimizer(self) -> SurfelAdam:
+        return SurfelAdam(self.surfels, self._optimizer_settings, self.extent, means_lr_steps=self._means_lr_steps)
 
     def activated(self, camera_center: Tensor, sh_degree: int) -> ActivatedSurfels:
         """Activated surfels as seen from ``camera_center`` (3,) world, SH up to ``sh_degree``."""
@@ -62,12 +66,18 @@ class SurfelSet:
         """Remember what the renderer of this step's view returned, until :meth:`step`."""
         self._observation = Observation(probe, weight_sum)
 
-    def step(self, step: int) -> None:
-        """Hand the view's signal to density control, then one step of Adam and the clamps that keep values finite."""
+    def step(self, step: int, sh_degree: int) -> None:
+        """Hand the view's signal to density control, then one step of Adam and the clamps that keep values finite.
+
+        ``sh_degree`` is the degree that :meth:`activated` used in this step.
+
+        Raises:
+            NonFiniteGradientError: a gradient held NaN or inf; gradients are kept for the report.
+        """
         if self._observation is not None and self._observation.probe.grad is not None:
             self.density.observe(self._observation.probe.grad, self._observation.weight_sum)
         self._observation = None
-        self.optimizer.step(step)
+        self.optimizer.step(step, sh_degree)
         self.optimizer.zero_grad()
         self._clamp()
 
@@ -121,6 +131,7 @@ class SurfelSet:
                     "train again from the start"
                 )
             setattr(self.surfels, name, parameters[name].clone().requires_grad_())
+        self.optimizer = self._new_optimizer()  # moments of the loaded number of surfels
         self.optimizer.load(part("adam"))
         self.density.load(part("density"))
         self._observation = None

@@ -66,30 +66,18 @@ def check_loss(terms: LossTerms, method: Method, step: int, view: str) -> float:
     Raises:
         TrainingDiverged: it is not finite.
     """
-    loss = float(terms.total)
+    loss = float(terms.total.detach())
     if math.isfinite(loss):
         return loss
     terms.total.backward()  # for the report alone: its gradients tell which surfels are involved
-    bad = tuple(term.name for term in terms.terms if not bool(torch.isfinite(term.value))) or ("total",)
-    raise TrainingDiverged(Divergence(step, view, _values(terms), bad, _bad_surfels(method)))
+    raise diverged(terms, method, step, view)
 
 
-def check_gradients(terms: LossTerms, method: Method, step: int, view: str) -> None:
-    """Raise :class:`TrainingDiverged` when a gradient is not finite. One sum per parameter when all is well."""
-    if all(_sum_is_finite(tensor.grad) for part in method.sets for _, tensor in part.surfels.items()):
-        return
-    bad = _bad_surfels(method)
-    if bad:  # else a finite sum overflowed: not our business
-        raise TrainingDiverged(Divergence(step, view, _values(terms), (), bad))
-
-
-def _sum_is_finite(tensor: Tensor | None) -> bool:
-    """NaN and inf survive a sum, so a finite sum has only finite parts."""
-    return tensor is None or bool(torch.isfinite(tensor.sum()))
-
-
-def _values(terms: LossTerms) -> tuple[tuple[str, float], ...]:
-    return tuple((term.name, float(term.value)) for term in terms.terms)
+def diverged(terms: LossTerms, method: Method, step: int, view: str) -> TrainingDiverged:
+    """The report of a step whose loss or gradients (still in ``.grad``) are not finite."""
+    bad = tuple(term.name for term in terms.terms if not math.isfinite(term.value))
+    values = tuple((term.name, term.value) for term in terms.terms)
+    return TrainingDiverged(Divergence(step, view, values, bad, _bad_surfels(method)))
 
 
 def _bad_surfels(method: Method) -> tuple[BadSurfels, ...]:

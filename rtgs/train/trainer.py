@@ -16,9 +16,10 @@ import torch
 from torch import Tensor
 
 import rtgs
-from rtgs.methods.base import Decision, LossTerms, Method, RenderOptions, Stage
+from rtgs.methods.base import Decision, LossTerm, Method, RenderOptions, Stage
 from rtgs.native import core
 from rtgs.scenes.scene import Scene
+from rtgs.train.adam import NonFiniteGradientError
 from rtgs.train.checkpoint import (
     Checkpoint,
     CheckpointRecord,
@@ -29,7 +30,7 @@ from rtgs.train.checkpoint import (
     load_newest,
     save_checkpoint,
 )
-from rtgs.train.guard import check_gradients, check_loss
+from rtgs.train.guard import check_loss, diverged
 from rtgs.train.progress import Progress, SilentProgress, StepReport
 from rtgs.train.schedule import OrderState, ViewOrder
 from rtgs.train.seeds import seed_for
@@ -106,7 +107,7 @@ class Trainer:
         self._step = self.stage.from_step
         self._elapsed_before = 0.0
         self._began = time.monotonic()
-        self._window: list[LossTerms] = []
+        self._window: list[tuple[LossTerm, ...]] = []
         self._settings = canonical_json(RunSettings(method.settings, method.schedule, seed))
         self._scene_digest = scene_digest(scene)
 
@@ -168,13 +169,16 @@ class Trainer:
         terms = self.method.losses(rendered, view, step)
         loss = check_loss(terms, self.method, step, view.name)
         terms.total.backward()
-        check_gradients(terms, self.method, step, view.name)
-        for event in self.method.after_step(step):
+        try:
+            events = self.method.after_step(step)
+        except NonFiniteGradientError as error:
+            raise diverged(terms, self.method, step, view.name) from error
+        for event in events:
             self.progress.note(f"step {step + 1}: {event.set_name}: {event.detail}")
         self._averages.add_loss(loss)
         if step % REPORT_EVERY == 0:
             self._averages.add_psnr(_psnr(rendered.image.detach(), view.image))
-        self._window.append(LossTerms(terms.total.detach(), terms.terms))
+        self._window.append(terms.terms)
         self._step = step + 1
 
     def _between_steps(self) -> None:
@@ -198,10 +202,12 @@ class Trainer:
         window, self._window = self._window, []
         if self.recorder is None or not window:
             return
-        values = {"train/loss": float(torch.stack([terms.total for terms in window]).mean())}
-        for name in dict.fromkeys(term.name for terms in window for term in terms.terms):
-            found = [term.value for terms in window for term in terms.terms if term.name == name]
-            values[f"train/{name}"] = float(torch.stack(found).mean())
+        sums: dict[str, list[float]] = {}
+        for terms in window:
+            sums.setdefault("train/loss", []).append(sum(term.weight * term.value for term in terms))
+            for term in terms:
+                sums.setdefault(f"train/{term.name}", []).append(term.value)
+        values = {name: sum(found) / len(found) for name, found in sums.items()}
         values["train/psnr"] = self._averages.psnr or 0.0
         for part in self.method.sets:
             values[f"surfels/{part.name}"] = float(len(part))

@@ -1,0 +1,188 @@
+"""Methods: what they render, which losses they compute and which not, and that they say so."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from training_cases import HEIGHT, WIDTH, small_method, small_scene, small_schedule
+
+from rtgs.methods import METHOD_NAMES, RenderOptions, Stage, create_method, method_stages
+from rtgs.methods import surfel_base as module
+from rtgs.render.buffers import RasterOptions
+from rtgs.train.seeds import generator_for
+from rtgs.train.settings import LossSettings, MethodSettings, RenderSettings
+
+
+def make(settings: MethodSettings | None = None, *, normals: bool = False, **schedule: int):
+    scene = small_scene(normals=normals)
+    settings = settings or small_method()
+    return create_method(settings, scene, small_schedule(**schedule), generator_for(0, "initialise")), scene
+
+
+def train_step(method, scene, step: int):
+    view = scene.train[step % len(scene.train)]
+    terms = method.losses(method.render(view.camera, step), view, step)
+    terms.total.backward()
+    return terms, method.after_step(step)
+
+
+@pytest.mark.parametrize("name", METHOD_NAMES)
+def test_every_method_renders_and_lowers_its_loss(name: str):
+    method, scene = make(small_method(name), densify_until=0)
+    first, _ = train_step(method, scene, 0)
+    for step in range(5, 200, 5):  # the same view again and again
+        last, _ = train_step(method, scene, step)
+    assert float(last.total.detach()) < 0.8 * float(first.total.detach())
+    assert method.stages == (Stage("diffuse", 0, 60),)
+    assert method_stages(method.settings, method.schedule) == method.stages
+
+
+def test_an_unknown_method_is_refused_with_the_known_ones():
+    with pytest.raises(ValueError, match=r"method\.name is '3dgz': choose one of 2dgs, rtgs"):
+        make(replace(small_method(), name="3dgz"))
+
+
+def test_rendering_gives_the_maps_that_were_asked_for():
+    method, scene = make()
+    with torch.no_grad():
+        plain = method.render(scene.test[0].camera, 0, RenderOptions())
+        full = method.render(scene.test[0].camera, 0, RenderOptions(True, True, True, True))
+    assert plain.image.shape == (3, HEIGHT, WIDTH)
+    assert plain.buffers.depth is None
+    assert plain.buffers.normal is None
+    assert plain.buffers.weight_sum is None
+    assert torch.equal(plain.image, full.image)
+    for name in ("depth", "median_depth", "distortion"):
+        assert getattr(full.buffers, name).shape == (HEIGHT, WIDTH)
+    assert full.buffers.normal is not None
+    assert full.buffers.normal.shape == (3, HEIGHT, WIDTH)
+
+
+def rendered_options(monkeypatch, settings: MethodSettings, step: int, **scene_kind) -> RasterOptions:
+    """The rasteriser options of one training render."""
+    asked: list[RasterOptions] = []
+    original = module.rasterize_surfels
+
+    def spy(*arguments, options, **rest):
+        asked.append(options)
+        return original(*arguments, options=options, **rest)
+
+    monkeypatch.setattr(module, "rasterize_surfels", spy)
+    method, scene = make(settings, **scene_kind)
+    train_step(method, scene, step)
+    return asked[0]
+
+
+def test_outputs_are_rendered_only_while_their_loss_is_on(monkeypatch):
+    settings = small_method()  # L_norm from a quarter of 60 steps
+    before = rendered_options(monkeypatch, settings, 14)
+    assert not (before.depth)
+    assert not (before.normal)
+    assert not (before.median_depth)
+    assert not (before.distortion)
+    assert before.weight_sum
+    after = rendered_options(monkeypatch, settings, 15)
+    assert after.depth
+    assert after.normal
+    assert not (after.median_depth)
+    assert not (after.distortion)
+
+
+def test_near_and_far_scale_with_the_scene(monkeypatch):
+    settings = replace(small_method(), render=RenderSettings(near=0.02, far=20.0))
+    options = rendered_options(monkeypatch, settings, 0)
+    assert options.near == pytest.approx(0.02 * 4.4)
+    assert options.far == pytest.approx(20 * 4.4)
+
+
+def test_median_depth_serves_the_normal_loss_when_the_ratio_asks_for_it(monkeypatch):
+    median = replace(small_method(), render=RenderSettings(depth_ratio=1.0))
+    options = rendered_options(monkeypatch, median, 20)
+    assert options.median_depth
+    assert not options.depth
+    mixed = replace(small_method(), render=RenderSettings(depth_ratio=0.5))
+    options = rendered_options(monkeypatch, mixed, 20)
+    assert options.median_depth
+    assert options.depth
+
+
+def test_a_zero_weight_is_never_computed_and_is_told(monkeypatch):
+    def never(*_arguments, **_options):
+        raise AssertionError("computed a term of weight 0")
+
+    for name in ("normal_consistency_loss", "mono_normal_loss", "distortion_loss"):
+        monkeypatch.setattr(module, name, never)
+    settings = replace(small_method(), loss=LossSettings(normal=0.0))
+    method, scene = make(settings, normals=True)
+    terms, _ = train_step(method, scene, 59)
+    assert [term.name for term in terms.terms] == ["l1", "dssim"]
+    told = {decision.what for decision in method.decisions}
+    assert told == {"no normal consistency loss", "no monocular normal loss", "no distortion loss"}
+
+
+def test_every_loss_that_is_on_is_computed_and_weighted():
+    loss = LossSettings(normal=0.05, normal_start=0, mono_normal=0.01, distortion=10.0, distortion_start=0)
+    method, scene = make(replace(small_method(), loss=loss), normals=True)
+    terms, _ = train_step(method, scene, 0)
+    assert [term.name for term in terms.terms] == ["l1", "dssim", "normal", "mono_normal", "distortion"]
+    weighted = sum(term.weight * term.value for term in terms.terms)
+    assert float(terms.total.detach()) == pytest.approx(weighted, rel=1e-5)
+    assert method.decisions == ()
+
+
+def test_without_normals_there_is_no_mono_loss_and_the_report_says_why():
+    method, scene = make()
+    terms, _ = train_step(method, scene, 59)
+    assert "mono_normal" not in [term.name for term in terms.terms]
+    assert any(
+        decision.what == "no monocular normal loss"
+        and "no training view has a normal map in scene small" in decision.why
+        for decision in method.decisions
+    )
+
+
+def test_views_without_normals_among_others_are_left_out_of_the_mono_loss():
+    scene = small_scene(normals=True)
+    bare = replace(scene.train[0], normal=None)
+    scene = replace(scene, train=(bare, *scene.train[1:]))
+    method = create_method(small_method(), scene, small_schedule(), generator_for(0, "initialise"))
+    names = [[term.name for term in train_step(method, scene, step)[0].terms] for step in (0, 1)]
+    assert "mono_normal" not in names[0]
+    assert "mono_normal" in names[1]
+    assert any("1 of 5 training views lack a normal map" in decision.why for decision in method.decisions)
+
+
+def test_density_control_and_resets_happen_as_scheduled_and_are_told():
+    method, scene = make(densify_from=5, densify_until=45, densify_every=20, opacity_reset_every=30)
+    events = {step: train_step(method, scene, step)[1] for step in range(41)}
+    kinds = {step + 1: [event.kind for event in found] for step, found in events.items() if found}
+    assert kinds == {20: ["density"], 30: ["opacity_reset"], 40: ["density"]}
+    assert "surfels" in events[19][0].detail
+    method, scene = make(densify_until=45, opacity_reset_every=30)
+    for step in range(30):
+        train_step(method, scene, step)
+    assert float(method.sets[0].surfels.opacity_logits.detach().sigmoid().max()) <= 0.0100001
+
+
+def test_state_goes_round_whatever_the_number_of_surfels():
+    method, scene = make()
+    for step in range(30):
+        train_step(method, scene, step)
+    state = {name: tensor.clone() for name, tensor in method.state().items()}
+    other, _ = make()
+    assert len(other.sets[0]) != len(method.sets[0])
+    other.load(state)
+    for step in range(30, 50):
+        train_step(method, scene, step)
+        train_step(other, scene, step)
+    for name, tensor in method.state().items():
+        assert torch.equal(tensor, other.state()[name]), name
+
+
+def test_a_state_of_another_method_is_refused():
+    method, _ = make()
+    state = {name.replace("base.", "other."): tensor for name, tensor in method.state().items()}
+    with pytest.raises(ValueError, match=r"no base\.surfels\.means"):
+        method.load(state)

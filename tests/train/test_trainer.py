@@ -1,0 +1,168 @@
+"""The training loop: it learns, tells, records, and stops at the first non-finite number."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from training_cases import small_method, small_scene, small_schedule, small_trainer
+
+from rtgs.train.checkpoint import load_newest
+from rtgs.train.guard import TrainingDiverged
+from rtgs.train.progress import LineProgress, StepReport
+from rtgs.train.settings import LossSettings
+from rtgs.train.trainer import scene_digest
+
+
+class Memory:
+    """A recorder and a progress that remember."""
+
+    def __init__(self) -> None:
+        self.rows: list[tuple[int, dict[str, float]]] = []
+        self.notes: list[str] = []
+        self.reports: list[StepReport] = []
+        self.closed = 0
+
+    def metrics(self, values: Mapping[str, float], step: int) -> None:
+        self.rows.append((step, dict(values)))
+
+    def start(self, title: str, done: int, total: int) -> None:
+        self.notes.append(f"{title} {done} {total}")
+
+    def advance(self, report: StepReport) -> None:
+        self.reports.append(report)
+
+    def note(self, text: str) -> None:
+        self.notes.append(text)
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+def test_training_learns_and_tells():
+    memory = Memory()
+    schedule = small_schedule(300, evaluate_every=150, opacity_reset_every=0)
+    trainer = small_trainer(schedule=schedule, progress=memory, recorder=memory)
+    before = trainer.evaluate()
+    summary = trainer.run()
+    assert summary.steps == 300
+    assert summary.psnr_test is not None
+    assert summary.psnr_test > before + 3
+    assert summary.psnr_train > 14
+    assert summary.surfels == len(trainer.method.sets[0]) > 300
+    assert summary.resumed_from is None
+    assert summary.seconds >= summary.seconds_per_step > 0
+    assert memory.closed == 1
+    assert memory.notes[0] == "diffuse 0 300"
+    assert any("no distortion loss: its weight is 0" in note for note in memory.notes)
+    assert sum("cloned" in note for note in memory.notes) == 2  # steps 20 and 40
+    assert memory.reports[-1].step == 300
+    steps = [step for step, _ in memory.rows]
+    assert steps == [50, 100, 150, 150, 200, 250, 300, 300]  # batches every 50, evaluations every 150
+    first = memory.rows[0][1]
+    assert first["train/loss"] > memory.rows[-2][1]["train/loss"]
+    assert {"train/l1", "train/dssim", "train/psnr", "surfels/base"} <= first.keys()
+    assert "train/normal" in memory.rows[-1][1]
+    assert "test/psnr" in memory.rows[3][1]
+
+
+def test_equal_seeds_give_equal_surfels_and_others_do_not():
+    def means(seed: int) -> torch.Tensor:
+        trainer = small_trainer(schedule=small_schedule(25), seed=seed)
+        trainer.run()
+        return trainer.method.sets[0].surfels.means.detach()
+
+    assert torch.equal(means(1), means(1))
+    assert not torch.equal(means(1)[:100], means(2)[:100])
+
+
+def test_lines_are_written_where_there_is_no_terminal():
+    stream = io.StringIO()
+    small_trainer(schedule=small_schedule(20), progress=LineProgress(stream, seconds=0)).run()
+    lines = stream.getvalue().splitlines()
+    assert any(line.startswith("diffuse: step 10/20  loss ") and "surfels" in line for line in lines)
+    assert any(line.startswith("diffuse: step 20/20") and line.endswith("0:00 left") for line in lines)
+
+
+def test_a_nan_pixel_stops_training_names_the_term_and_leaves_the_checkpoint(tmp_path: Path):
+    scene = small_scene()
+    trainer = small_trainer(scene, schedule=small_schedule(checkpoint_every=10), checkpoint_dir=tmp_path)
+
+    original = trainer.method.losses
+
+    def poisoned(rendered, view, step):
+        image = view.image.clone()
+        if step == 13:
+            image[1, 4, 5] = math.nan
+        return original(rendered, replace(view, image=image), step)
+
+    trainer.method.losses = poisoned  # type: ignore[method-assign]
+    with pytest.raises(TrainingDiverged, match="training diverged at step 13") as caught:
+        trainer.run()
+    assert "loss terms that are not finite: l1, dssim" in str(caught.value)
+    assert "The last checkpoint is intact" in str(caught.value)
+    newest = load_newest(tmp_path, warn=pytest.fail)
+    assert newest is not None
+    assert newest.record.step == 10
+    assert all(bool(torch.isfinite(t).all()) for t in newest.tensors.values() if t.is_floating_point())
+
+
+def test_a_nan_gradient_stops_training_and_names_parameter_and_surfels():
+    trainer = small_trainer(schedule=small_schedule())
+    surfels = trainer.method.sets[0].surfels
+
+    def poison(gradient: torch.Tensor) -> torch.Tensor:
+        gradient = gradient.clone()
+        gradient[[3, 8]] = math.inf
+        return gradient
+
+    surfels.log_scales.register_hook(poison)
+    with pytest.raises(TrainingDiverged) as caught:
+        trainer.run()
+    (bad,) = caught.value.divergence.surfels
+    assert (bad.set_name, bad.tensor, bad.count, bad.ids) == ("base", "gradient of log_scales", 2, (3, 8))
+    assert "step 0, view 'view_" in str(caught.value)
+    assert "surfel 3: inf, inf" in str(caught.value)
+
+
+def test_a_trainer_without_test_views_has_no_test_psnr():
+    scene = replace(small_scene(), test=())
+    assert small_trainer(scene, schedule=small_schedule(3)).run().psnr_test is None
+
+
+def test_metrics_are_flushed_when_training_breaks():
+    memory = Memory()
+    settings = replace(small_method(), loss=LossSettings(normal=0.0))
+    trainer = small_trainer(settings=settings, schedule=small_schedule(40), recorder=memory, progress=memory)
+    after_step = trainer.method.after_step
+
+    def failing(step: int):
+        if step == 30:
+            raise KeyboardInterrupt
+        return after_step(step)
+
+    trainer.method.after_step = failing  # type: ignore[method-assign]
+    with pytest.raises(KeyboardInterrupt):
+        trainer.run()
+    assert [step for step, _ in memory.rows] == [30]
+    assert memory.closed == 1
+
+
+def test_scene_digest_tells_images_cameras_and_points():
+    scene = small_scene()
+    view = scene.train[0]
+    brighter = replace(view, image=view.image * 0.9)
+    moved = replace(view, camera=replace(view.camera, translation=view.camera.translation + 0.1))
+    digests = {
+        scene_digest(scene),
+        scene_digest(replace(scene, train=(brighter, *scene.train[1:]))),
+        scene_digest(replace(scene, train=(moved, *scene.train[1:]))),
+        scene_digest(replace(scene, points=scene.points + 0.1)),
+    }
+    assert len(digests) == 4
+    assert scene_digest(scene) == scene_digest(small_scene())
