@@ -6,10 +6,9 @@ marching cubes and removal of small pieces.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from types import ModuleType
-from typing import Any
 
 import numpy as np
 import torch
@@ -86,40 +85,94 @@ def focus_region(cameras: Sequence[Camera]) -> FocusRegion:
     return FocusRegion(center, float(np.linalg.norm(centers - center, axis=1).min()))
 
 
-def fuse_depths(views: Sequence[DepthView], settings: TsdfSettings = TsdfSettings()) -> MeshResult:
-    """Fuse the views and extract the mesh.
+def fuse_depths(
+    views: Iterable[DepthView], cameras: Sequence[Camera], settings: TsdfSettings = TsdfSettings()
+) -> MeshResult:
+    """Fuse the views and extract the mesh; views are taken one by one, so an iterator need not hold them all.
+
+    ``cameras``: those of the views, from which lengths are derived where the settings say 0. The mesh has colours when
+    the first view has an image; then every view must.
 
     Raises:
-        RtgsError: no views, no usable depth, more blocks than ``max_blocks``, no surface left, or Open3D's system
+        RtgsError: no cameras, no usable depth, more blocks than ``max_blocks``, no surface left, or Open3D's system
             library is missing.
     """
-    depth_trunc, voxel = fusion_lengths([view.camera for view in views], settings)
-    open3d = import_open3d()
-    core = open3d.core
-    with_color = all(view.image is not None for view in views)
-    names, types, shapes = ["tsdf", "weight"], [core.float32] * 2, [(1), (1)]
-    if with_color:
-        names, types, shapes = [*names, "color"], [*types, core.float32], [*shapes, (3)]
-    grid = open3d.t.geometry.VoxelBlockGrid(tuple(names), tuple(types), tuple(shapes), voxel, BLOCK, FIRST_BLOCKS)
-    touched = 0
+    depth_trunc, voxel = fusion_lengths(cameras, settings)
+    fusion: _Fusion | None = None
     for view in views:
-        depth = usable_depth(view, depth_trunc, settings.min_alpha)
-        blocks = blocks_near_surface(view.camera, depth, voxel, settings.truncation_voxels)
-        if len(blocks):
-            touched += len(blocks)
-            _integrate(open3d, grid, view, depth, blocks, depth_trunc, settings.truncation_voxels, with_color)
-        allocated = int(grid.hashmap().size())
+        if fusion is None:
+            fusion = _Fusion(settings, voxel, depth_trunc, with_color=view.image is not None)
+        fusion.add(view)
+    if fusion is None or fusion.observed == 0:
+        raise RtgsError(
+            f"none of the {len(cameras)} views has a depth in (0, {depth_trunc:g}] with alpha >= "
+            f"{settings.min_alpha:g} (inside the masks, where given): nothing to fuse"
+        )
+    return fusion.extract()
+
+
+class _Fusion:
+    """The voxel grid while views are added."""
+
+    def __init__(self, settings: TsdfSettings, voxel: float, depth_trunc: float, with_color: bool) -> None:
+        self.settings, self.voxel, self.depth_trunc, self.with_color = settings, voxel, depth_trunc, with_color
+        self.observed = 0  # pixels fused
+        self._open3d = import_open3d()
+        number = self._open3d.core.float32
+        shapes = {"tsdf": (1), "weight": (1)} | ({"color": (3)} if with_color else {})
+        self._grid = self._open3d.t.geometry.VoxelBlockGrid(
+            tuple(shapes), (number,) * len(shapes), tuple(shapes.values()), voxel, BLOCK, FIRST_BLOCKS
+        )
+
+    def add(self, view: DepthView) -> None:
+        """Integrate one view. Open3D truncates pixel coordinates: pixel edges at integers, as in our cameras."""
+        camera, settings = view.camera, self.settings
+        depth = usable_depth(view, self.depth_trunc, settings.min_alpha)
+        blocks = blocks_near_surface(camera, depth, self.voxel, settings.truncation_voxels)
+        if len(blocks) == 0:
+            return
+        geometry, tensor = self._open3d.t.geometry, self._open3d.core.Tensor
+        images = [geometry.Image(depth)]
+        if self.with_color:
+            if view.image is None:
+                raise ValueError(f"view {camera.name!r} has no image although the first view has one")
+            images.append(geometry.Image(view.image.detach().float().clamp(0, 1).permute(1, 2, 0).contiguous().numpy()))
+        intrinsic = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
+        extrinsic = np.eye(4)
+        extrinsic[:3, :3], extrinsic[:3, 3] = camera.rotation.numpy(), camera.translation.numpy()
+        scale = 1.0
+        self._grid.integrate(
+            tensor(blocks),
+            *images,
+            tensor(intrinsic),
+            tensor(extrinsic),
+            scale,
+            self.depth_trunc,
+            settings.truncation_voxels,
+        )
+        self.observed += int((depth > 0).sum())
+        allocated = int(self._grid.hashmap().size())
         if allocated > settings.max_blocks:
             raise RtgsError(
                 f"the mesh grid reached {allocated} blocks of {BLOCK}^3 voxels, max_blocks is {settings.max_blocks}: "
-                f"raise the voxel (now {voxel:g}) or lower depth_trunc (now {depth_trunc:g})"
+                f"raise the voxel (now {self.voxel:g}) or lower depth_trunc (now {self.depth_trunc:g})"
             )
-    if touched == 0:
-        raise RtgsError(
-            f"none of the {len(views)} views has a depth in (0, {depth_trunc:g}] with alpha >= {settings.min_alpha:g}"
-            " (inside the masks, where given): nothing to fuse"
-        )
-    return _extract(grid, settings, voxel, depth_trunc, with_color)
+
+    def extract(self) -> MeshResult:
+        """Marching cubes, then the largest pieces."""
+        settings = self.settings
+        found = self._grid.extract_triangle_mesh(weight_threshold=settings.min_weight)
+        vertices = found.vertex.positions.numpy() if "positions" in found.vertex else np.empty((0, 3), np.float32)
+        faces = found.triangle.indices.numpy() if "indices" in found.triangle else np.empty((0, 3), np.int32)
+        colors = np.clip(found.vertex.colors.numpy(), 0, 1) if self.with_color and len(vertices) else None
+        whole = TriangleMesh(vertices, faces, colors)
+        mesh, clusters, kept = largest_pieces(whole, settings.keep_clusters, settings.min_triangles)
+        if len(mesh.faces) == 0:
+            raise RtgsError(
+                f"the fused mesh has no piece of {settings.min_triangles} triangles ({clusters} smaller ones): "
+                f"the depths do not agree at a voxel of {self.voxel:g}, or the voxel is too coarse for the object"
+            )
+        return MeshResult(mesh, self.voxel, self.depth_trunc, clusters, kept)
 
 
 def fusion_lengths(cameras: Sequence[Camera], settings: TsdfSettings) -> tuple[float, float]:
@@ -211,46 +264,6 @@ def import_open3d() -> ModuleType:
         )
         raise RtgsError(f"mesh extraction needs Open3D, which does not load: {error}; {hint}") from error
     return open3d
-
-
-def _integrate(
-    open3d: ModuleType,
-    grid: Any,
-    view: DepthView,
-    depth: np.ndarray,
-    blocks: np.ndarray,
-    depth_trunc: float,
-    truncation_voxels: float,
-    with_color: bool,
-) -> None:
-    """Add one view. Open3D truncates pixel coordinates to integers: pixel edges at integers, as in our cameras."""
-    camera = view.camera
-    intrinsic = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
-    extrinsic = np.eye(4)
-    extrinsic[:3, :3], extrinsic[:3, 3] = camera.rotation.numpy(), camera.translation.numpy()
-    images = [open3d.t.geometry.Image(depth)]
-    if with_color and view.image is not None:
-        pixels = view.image.detach().float().clamp(0, 1).permute(1, 2, 0).contiguous().numpy()
-        images.append(open3d.t.geometry.Image(pixels))
-    matrices = open3d.core.Tensor(intrinsic), open3d.core.Tensor(extrinsic)
-    grid.integrate(open3d.core.Tensor(blocks), *images, *matrices, 1.0, depth_trunc, truncation_voxels)
-
-
-def _extract(grid: Any, settings: TsdfSettings, voxel: float, depth_trunc: float, with_color: bool) -> MeshResult:
-    """Marching cubes, then the largest pieces."""
-    extracted = grid.extract_triangle_mesh(weight_threshold=settings.min_weight)
-    vertices = extracted.vertex.positions.numpy() if "positions" in extracted.vertex else np.empty((0, 3), np.float32)
-    faces = extracted.triangle.indices.numpy() if "indices" in extracted.triangle else np.empty((0, 3), np.int32)
-    colors = np.clip(extracted.vertex.colors.numpy(), 0, 1) if with_color and len(vertices) else None
-    mesh, clusters, kept = largest_pieces(
-        TriangleMesh(vertices, faces, colors), settings.keep_clusters, settings.min_triangles
-    )
-    if len(mesh.faces) == 0:
-        raise RtgsError(
-            f"the fused mesh has no piece of {settings.min_triangles} triangles ({clusters} smaller ones): "
-            f"the depths do not agree at a voxel of {voxel:g}, or the voxel is too coarse for the object"
-        )
-    return MeshResult(mesh, voxel, depth_trunc, clusters, kept)
 
 
 def largest_pieces(mesh: TriangleMesh, keep: int, min_triangles: int) -> tuple[TriangleMesh, int, int]:

@@ -14,6 +14,8 @@ from torch import Tensor
 
 from rtgs.cameras import Camera
 from rtgs.evaluate.images import colorize
+from rtgs.mesh.guide import MeshGuide
+from rtgs.mesh.triangles import TriangleMesh
 
 DEPTH_COLORMAP = "turbo"
 COVERED = 0.5  # alpha from which a pixel counts when the depth range is chosen
@@ -81,6 +83,19 @@ def alpha_picture(alpha: Tensor) -> np.ndarray:
     """(H, W) accumulated alpha as grey levels, black 0 and white 1."""
     grey = (alpha.detach().clamp(0, 1) * 255).round().nan_to_num(nan=0.0).to(torch.uint8)
     return grey.unsqueeze(-1).expand(-1, -1, 3).contiguous().numpy()
+
+
+def mesh_picture(mesh: TriangleMesh, camera: Camera) -> np.ndarray:
+    """(H, W, 3) uint8: the mesh as grey clay lit from the camera, back faces tinted red, white where there is none."""
+    guide = MeshGuide(mesh, 0.0)
+    pair = guide.surfaces(camera)
+    normals = mesh.face_normals()
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-30)
+    toward = torch.nn.functional.normalize(camera.rays(torch.float64).directions, dim=-1).numpy()
+    facing = np.abs(np.einsum("hwc,hwc->hw", normals[pair.near_triangle.numpy()], toward))
+    clay = np.where(pair.near_back_facing.numpy()[..., None], (0.80, 0.45, 0.42), (0.74, 0.76, 0.80))
+    shaded = clay * (0.25 + 0.75 * facing)[..., None]
+    return (np.where(pair.hit.numpy()[..., None], shaded, 1.0) * 255).round().astype(np.uint8)
 
 
 def image_bytes(pixels: np.ndarray, long_side: int, quality: int) -> bytes:

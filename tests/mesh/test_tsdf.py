@@ -12,6 +12,7 @@ from rtgs.errors import RtgsError
 from rtgs.mesh.triangles import TriangleMesh, read_mesh_ply, write_mesh_obj, write_mesh_ply
 from rtgs.mesh.tsdf import (
     DepthView,
+    MeshResult,
     TsdfSettings,
     blocks_near_surface,
     focus_region,
@@ -42,13 +43,17 @@ def sphere_view(camera: Camera) -> DepthView:
     return DepthView(camera, torch.where(hit, near, 0.0).float(), image, hit.float())
 
 
+def fused(views: list[DepthView], settings: TsdfSettings) -> MeshResult:
+    return fuse_depths(iter(views), [view.camera for view in views], settings)
+
+
 def sphere_views(count: int = 20) -> list[DepthView]:
     return [sphere_view(camera) for camera in cameras_around(count)]
 
 
 def test_sphere_is_recovered_within_a_voxel() -> None:
     settings = TsdfSettings(depth_trunc=6.0, voxel=6.0 / 160)
-    result = fuse_depths(sphere_views(), settings)
+    result = fused(sphere_views(), settings)
     distance = np.linalg.norm(result.mesh.vertices, axis=1) - RADIUS
     assert np.abs(distance).mean() < 0.25 * result.voxel
     assert np.abs(distance).max() < 1.5 * result.voxel
@@ -65,7 +70,7 @@ def test_derived_lengths_are_those_of_2dgs() -> None:
     region = focus_region([view.camera for view in views])
     np.testing.assert_allclose(region.center, 0, atol=1e-9)
     assert region.radius == pytest.approx(3.0)
-    result = fuse_depths(views, TsdfSettings(resolution=96))
+    result = fused(views, TsdfSettings(resolution=96))
     assert result.depth_trunc == pytest.approx(6.0)
     assert result.voxel == pytest.approx(6.0 / 96)
 
@@ -118,15 +123,17 @@ def test_small_pieces_go() -> None:
 def test_what_cannot_be_fused_is_explained() -> None:
     view = sphere_view(cameras_around(3)[0])
     with pytest.raises(RtgsError, match="nothing to fuse"):
-        fuse_depths([DepthView(view.camera, torch.zeros_like(view.depth))], TsdfSettings(depth_trunc=6.0))
+        fused([DepthView(view.camera, torch.zeros_like(view.depth))], TsdfSettings(depth_trunc=6.0))
     with pytest.raises(RtgsError, match="no training views"):
-        fuse_depths([])
+        fuse_depths([], [])
+    with pytest.raises(ValueError, match="has no image although the first view has one"):
+        fused([view, DepthView(view.camera, view.depth)], TsdfSettings(depth_trunc=6.0, voxel=0.1))
     with pytest.raises(RtgsError, match="max_blocks is 10"):
-        fuse_depths([view], TsdfSettings(depth_trunc=6.0, voxel=0.05, max_blocks=10))
+        fused([view], TsdfSettings(depth_trunc=6.0, voxel=0.05, max_blocks=10))
     with pytest.raises(RtgsError, match="0 < voxel < depth_trunc"):
-        fuse_depths([view], TsdfSettings(depth_trunc=0.01, voxel=0.05))
+        fused([view], TsdfSettings(depth_trunc=0.01, voxel=0.05))
     with pytest.raises(RtgsError, match="no piece of 1000000 triangles"):
-        fuse_depths([view], TsdfSettings(depth_trunc=6.0, voxel=0.1, min_triangles=1_000_000))
+        fused([view], TsdfSettings(depth_trunc=6.0, voxel=0.1, min_triangles=1_000_000))
 
 
 def test_missing_system_library_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -139,7 +146,7 @@ def test_missing_system_library_says_what_to_install(monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(builtins, "__import__", failing)
     with pytest.raises(RtgsError, match=r"install libusb-1\.0-0"):
-        fuse_depths(sphere_views(2), TsdfSettings(depth_trunc=6.0, voxel=0.1))
+        fused(sphere_views(2), TsdfSettings(depth_trunc=6.0, voxel=0.1))
 
 
 def test_files_round_trip(tmp_path: Path) -> None:

@@ -15,7 +15,8 @@ from PIL import Image
 
 from rtgs.cameras import Camera
 from rtgs.evaluate.evaluate import METRICS, EvaluationTable, RunFacts, ViewScore
-from rtgs.report.figures import Curve, curve_svg, depth_picture, image_bytes, normal_picture
+from rtgs.mesh.triangles import TriangleMesh
+from rtgs.report.figures import Curve, curve_svg, depth_picture, image_bytes, mesh_picture, normal_picture
 from rtgs.report.page import (
     PICTURE_STEPS,
     TARGET_BYTES,
@@ -256,3 +257,14 @@ def test_curves_skip_what_cannot_be_drawn() -> None:
     )
     with pytest.raises(ValueError, match="2 steps and 1 values"):
         Curve("a", (0, 1), (1.0,))
+
+
+def test_mesh_picture_shows_clay_and_the_wrong_side() -> None:
+    wall = np.array([[-9, -9, 2], [9, -9, 2], [0, 9, 2]], np.float32)
+    camera = Camera(torch.eye(3), torch.zeros(3), 10.0, 10.0, 5.0, 5.0, 10, 10)
+    facing = mesh_picture(TriangleMesh(wall, np.array([[0, 2, 1]])), camera)
+    turned = mesh_picture(TriangleMesh(wall, np.array([[0, 1, 2]])), camera)
+    assert (facing[5, 5] > 180).all()
+    assert turned[5, 5, 0] > turned[5, 5, 2] + 50
+    behind = mesh_picture(TriangleMesh(wall - np.float32([0, 0, 9]), np.array([[0, 1, 2]])), camera)
+    assert (behind == 255).all()

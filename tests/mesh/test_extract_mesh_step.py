@@ -1,0 +1,94 @@
+"""The pipeline step: from an imported scene and a trained method (here an analytic sphere) to mesh files."""
+
+import json
+import logging
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from pipelines import extract_mesh as step
+from rtgs.cameras import Camera
+from rtgs.errors import RtgsError
+from rtgs.mesh.triangles import read_mesh_ply
+from rtgs.mesh.tsdf import TsdfSettings
+from rtgs.methods import RenderedView, RenderOptions
+from rtgs.pipeline import StepContext
+from rtgs.render.buffers import RasterBuffers
+from rtgs.scenes.canonical import save_scene
+from rtgs.scenes.scene import Scene, View
+from rtgs.track.null import NullTracker
+from tests.mesh.shapes import camera_at, sphere_depths
+
+PARAMS = step.ExtractMeshParams(TsdfSettings(depth_trunc=6.0, voxel=6.0 / 96), obj=True)
+
+
+class SphereMethod:
+    """Renders a half-transparent unit sphere: the buffers hold sums of w z, as the rasteriser's do."""
+
+    def render(self, camera: Camera, step: int, options: RenderOptions | None = None) -> RenderedView:
+        assert options is not None
+        assert options.depth
+        near, _ = sphere_depths(camera, 1.0)
+        alpha = torch.isfinite(near).float() * 0.8
+        depth = torch.where(alpha > 0, near, 0.0).float() * alpha
+        image = torch.full((3, camera.height, camera.width), 0.4)
+        buffers = RasterBuffers(image, alpha, depth=depth, median_depth=torch.where(alpha > 0, near, 0.0).float())
+        return RenderedView(camera, image, buffers)
+
+
+def sphere_scene(masked: bool) -> Scene:
+    views = []
+    for k in range(13):
+        angle, z = 2.4 * k, 1 - 2 * (k + 0.5) / 13
+        ring = (1 - z * z) ** 0.5
+        camera = camera_at((3 * ring * np.cos(angle), 3 * ring * np.sin(angle), 3 * z), width=96, height=80, focal=110)
+        camera = replace(camera, name=f"{k:02d}.png")
+        upper = torch.zeros(80, 96, dtype=torch.bool)
+        upper[:40] = True
+        views.append(View(camera, torch.full((3, 80, 96), 0.4), upper if masked else None, None, f"{k:02d}.png"))
+    return Scene("sphere", tuple(views[1:]), tuple(views[:1]), torch.zeros(4, 3), torch.zeros(4, 3), 3.3, "test")
+
+
+@pytest.fixture
+def context(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> StepContext:
+    monkeypatch.setattr(step, "last_training", lambda inputs: inputs["train_diffuse"])
+    monkeypatch.setattr(step, "load_method", lambda folder, scene: (SphereMethod(), SimpleNamespace(until=100)))
+    for name in ("scene", "out", "partial"):
+        (tmp_path / name).mkdir()
+    save_scene(sphere_scene(masked=False), tmp_path / "scene")
+    inputs = {"import_scene": tmp_path / "scene", "train_diffuse": tmp_path}
+    return StepContext(inputs, tmp_path / "out", tmp_path / "partial", logging.getLogger("test"), NullTracker())
+
+
+@pytest.mark.parametrize("depth_ratio", [0.0, 1.0])
+def test_mesh_of_the_training_views(context: StepContext, depth_ratio: float) -> None:
+    step.extract_mesh(replace(PARAMS, depth_ratio=depth_ratio), context)
+    mesh = read_mesh_ply(context.out / "mesh.ply")
+    error = np.abs(np.linalg.norm(mesh.vertices, axis=1) - 1)
+    assert error.mean() < 0.3 * 6.0 / 96
+    record = json.loads((context.out / "mesh.json").read_text())
+    assert record["faces"] == len(mesh.faces)
+    assert record["picture_from"] == "00.png"
+    with Image.open(context.out / "mesh.png") as picture:
+        assert picture.size == (96, 80)
+        assert picture.getpixel((48, 40)) != (255, 255, 255)
+    assert (context.out / "mesh.obj").is_file()
+
+
+def test_masked_mesh_needs_masks(context: StepContext) -> None:
+    params = replace(PARAMS, only_masked=True)
+    with pytest.raises(RtgsError, match="'sphere' has no masks"):
+        step.extract_mesh(params, context)
+
+
+def test_masked_mesh_holds_less(context: StepContext) -> None:
+    step.extract_mesh(PARAMS, context)
+    whole = len(read_mesh_ply(context.out / "mesh.ply").faces)
+    save_scene(sphere_scene(masked=True), context.inputs["import_scene"])
+    step.extract_mesh(replace(PARAMS, only_masked=True), context)
+    assert len(read_mesh_ply(context.out / "mesh.ply").faces) < whole
