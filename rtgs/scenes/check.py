@@ -96,7 +96,7 @@ def _side_images(kind: str, capture: Capture, settings: SceneSettings) -> Iterat
             continue
         size = (pixels.shape[1], pixels.shape[0])
         photo = _photo_size(view)
-        if photo and not same_aspect(size, photo) and not same_aspect(size, (photo[1], photo[0])):
+        if photo and not same_aspect(size, photo):
             what = f"{kind} of {size[0]}x{size[1]} pixels for a photo of {photo[0]}x{photo[1]}"
             yield Finding("error", what, str(path), f"make the {kind} from this very photo")
     if used and len(used) < len(capture.views):

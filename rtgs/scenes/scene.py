@@ -116,7 +116,10 @@ def load_scene(settings: SceneSettings) -> Scene:
             pixels, or the first unreadable file.
     """
     capture = read_capture(settings)
-    raise_errors(capture_findings(capture), capture.root)
+    findings = capture_findings(capture)
+    raise_errors(findings, capture.root)
+    for finding in findings:
+        log.log(logging.WARNING if finding.severity == "warning" else logging.INFO, "%s", finding.message)
     views = select_views(capture, settings)
     split = choose_split(capture, [view.name for view in views], settings)
     by_name = {view.name: view for view in views}

@@ -21,6 +21,7 @@ _PINHOLE_PARAMETERS = {
     "SIMPLE_DIVISION": 3,
     "DIVISION": 4,
 }
+_PROBE_SIDE = 128  # pixels; long side at which a lens is tried out
 _MAX_OUTSIDE_SHARE = 0.01  # of the undistorted pixels; above it the lens parameters cannot be right
 
 
@@ -99,6 +100,12 @@ def check_lens(lens: Lens, name: str) -> str | None:
         return str(error)
     if min(pinhole.params[:2]) <= 0:
         return f"camera of {name}: focal lengths {pinhole.params[:2]} must be positive"
+    if not lens.is_pinhole:
+        scale = min(1.0, _PROBE_SIDE / max(lens.width, lens.height))
+        try:
+            undistortion_map(lens.resized(max(2, round(lens.width * scale)), max(2, round(lens.height * scale))))
+        except CaptureError as error:
+            return str(error)
     return None
 
 
@@ -136,7 +143,7 @@ def undistortion_map(lens: Lens) -> np.ndarray:
     They are array indices (pixel centres at integers), as ``cv2.remap`` wants them.
 
     Raises:
-        CaptureError: more than 1 % of the undistorted pixels fall outside the photo.
+        CaptureError: more than 1 % of the undistorted pixels fall outside the photo or where the model folds over.
     """
     target = lens.pinhole()
     fx, fy, cx, cy = target.params
@@ -148,14 +155,23 @@ def undistortion_map(lens: Lens) -> np.ndarray:
     for row in range(target.height):
         ray[:, 1] = (row + 0.5 - cy) / fy
         result[:, row] = np.asarray(camera.img_from_cam(ray)).T - 0.5
-    inside = (result >= -1).all(0) & (result[0] <= lens.width) & (result[1] <= lens.height)
-    outside_share = 1 - float(inside.mean())
-    if not outside_share <= _MAX_OUTSIDE_SHARE:
+    bad_share = 1 - float(_valid(result, lens).mean())
+    if not bad_share <= _MAX_OUTSIDE_SHARE:
         raise CaptureError(
-            f"camera {lens.model} {lens.params}: {outside_share:.1%} of the undistorted pixels fall outside the "
-            f"{lens.width}x{lens.height} photo; the distortion parameters are not plausible, calibrate again"
+            f"camera {lens.model} {lens.params}: {bad_share:.1%} of the undistorted pixels fall outside the "
+            f"{lens.width}x{lens.height} photo or where the distortion folds over; the parameters are not plausible, "
+            "calibrate again"
         )
     return result
+
+
+def _valid(grid: np.ndarray, lens: Lens) -> np.ndarray:
+    """(H, W) bool: the pixel comes from inside the photo, and the map keeps its orientation around it."""
+    inside = (grid >= -1).all(0) & (grid[0] <= lens.width) & (grid[1] <= lens.height)
+    if min(inside.shape) < 2:
+        return inside
+    down, right = np.gradient(grid, axis=(1, 2))
+    return inside & (right[0] * down[1] - right[1] * down[0] > 0)
 
 
 def undistort_image(image: np.ndarray, lens: Lens) -> np.ndarray:

@@ -26,8 +26,10 @@ def root(tmp_path):
     return root
 
 
-def same(a, b):
-    return (a is None and b is None) or (a.dtype == b.dtype and torch.equal(a, b))
+def same(a: torch.Tensor | None, b: torch.Tensor | None) -> bool:
+    if a is None or b is None:
+        return a is b
+    return a.dtype == b.dtype and torch.equal(a, b)
 
 
 def test_round_trip_is_exact(root, tmp_path):

@@ -105,7 +105,7 @@ def test_full_images_go_before_shrunk_ones_and_large_before_small(tmp_path):
         save_image(path, pinhole_picture(width=32, height=24))
     assert find_images(root, None, names).name == "images_480"
     assert find_images(root, "images_2", names).name == "images_2"
-    with pytest.raises(CaptureError, match="images folder .*elsewhere does not exist"):
+    with pytest.raises(CaptureError, match=r"images folder .*elsewhere does not exist"):
         find_images(root, "elsewhere", names)
 
 

@@ -66,7 +66,7 @@ def test_alpha_is_composited(tmp_path, mode):
 def test_float_images_must_be_in_range(tmp_path):
     path = saved(tmp_path, Image.fromarray(GREY.astype(np.float32) / 255), "a.tif")
     np.testing.assert_allclose(read_photo(path)[..., 2], GREY / 255, atol=1e-6)
-    with pytest.raises(CaptureError, match="values from .* to 25[0-9]: only images of 8 or 16 bits"):
+    with pytest.raises(CaptureError, match=r"values from .* to 25[0-9]: only images of 8 or 16 bits"):
         read_photo(saved(tmp_path, Image.fromarray(GREY.astype(np.float32)), "a.tif"))
 
 

@@ -71,8 +71,8 @@ def test_file_path_without_suffix_or_with_dot(tmp_path):
     ],
 )
 def test_distortion_is_undone(tmp_path, model, names, params, inverse):
-    keys = dict(zip(("fl_x", "fl_y", "cx", "cy", *names), params)) | {"w": SIZE[0], "h": SIZE[1]}
-    root = write_transforms(tmp_path, views=4, camera_model=model, **keys)
+    root = write_transforms(tmp_path, views=4, camera_model=model, w=SIZE[0], h=SIZE[1])
+    edit_transforms(root, lambda c: c.update(zip(("fl_x", "fl_y", "cx", "cy", *names), params)))
     rays = inverse(pixel_centers(*SIZE))
     for path in (root / "images").iterdir():
         save_image(path, pattern(rays[..., 0], rays[..., 1]))

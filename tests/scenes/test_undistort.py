@@ -147,13 +147,19 @@ def test_the_map_is_exact_where_the_formula_is_known():
 
 
 def test_spherical_and_implausible_lenses_are_refused_with_advice():
-    with pytest.raises(CaptureError, match="EQUIRECTANGULAR sees all around.*cut the panoramas"):
+    with pytest.raises(CaptureError, match=r"EQUIRECTANGULAR sees all around.*cut the panoramas"):
         undistorted_lens(Lens("EQUIRECTANGULAR", 64, 32, (64.0, 32.0)))
     assert "NaN" in str(check_lens(Lens("PINHOLE", 8, 8, (float("nan"), 1.0, 1.0, 1.0)), "a.png"))
     assert "not positive" in str(check_lens(Lens("PINHOLE", 8, 8, (-1.0, 1.0, 4.0, 4.0)), "a.png"))
     assert "must be positive" in str(check_lens(Lens("PINHOLE", 8, 8, (1.0, -1.0, 4.0, 4.0)), "a.png"))
     assert "image size 0x8" in str(check_lens(Lens("PINHOLE", 0, 8, (1.0, 1.0, 4.0, 4.0)), "a.png"))
     assert check_lens(Lens("OPENCV", *SIZE, OPENCV), "a.png") is None
+    outside = Lens("OPENCV", *SIZE, (60.0, 60.0, 80.0, 60.0, -0.5, 0.0, 0.0, 0.0))
+    folded = Lens("OPENCV", *SIZE, (100.0, 100.0, 80.0, 60.0, -0.4, 0.0, 0.0, 0.0))
+    for lens in (outside, folded):
+        with pytest.raises(CaptureError, match="the parameters are not plausible, calibrate again"):
+            undistortion_map(lens)
+        assert "not plausible" in str(check_lens(lens, "a.png"))
     with pytest.raises(CaptureError, match="takes fx, fy, cx, cy"):
         Lens("OPENCV", 8, 8, (1.0, 2.0, 0.1, 0.1, 0.1)).pinhole()
     with pytest.raises(CaptureError, match="BOGUS"):
