@@ -164,6 +164,8 @@ class DensityControl:
         too_large_pruned = too_large & self._lowest_weights(s.low_weight_share)
         too_large_split = too_large & ~too_large_pruned
         rest = high_signal & ~transparent & ~too_large
+        room = int((1 + s.cap_turnover) * self.cap) - int((~transparent & ~too_large_pruned).sum())
+        rest = highest(rest, self.mean_signal, room)
         split = rest & (size > s.size_border * self.extent)
         clone = rest & ~split
 
@@ -194,6 +196,11 @@ class DensityControl:
             total=len(surfels),
         )
 
+    @property
+    def cap(self) -> int:
+        """N that a call never leaves exceeded."""
+        return int(self.settings.cap_share * self.settings.max_surfels)
+
     def _lowest_weights(self, share: float) -> Tensor:
         """(N,) bool: mean weight below that quantile (as in EnvGS: where that many are 0, none is below)."""
         weight = self.mean_weight
@@ -201,7 +208,7 @@ class DensityControl:
 
     def _capped(self, plan: RowPlan, weights: Tensor) -> tuple[RowPlan, int]:
         """The plan without the rows of lowest weight above the cap, and how many (children weigh as the parent)."""
-        excess = len(weights) - int(self.settings.cap_share * self.settings.max_surfels)
+        excess = len(weights) - self.cap
         if excess <= 0:
             return plan, 0
         stays = torch.ones(len(weights), dtype=torch.bool)
@@ -249,6 +256,17 @@ class DensityControl:
         self.signal_sum = state["signal_sum"].detach().float().clone()
         self.weight_sum = state["weight_sum"].detach().float().clone()
         self.visible_steps = state["visible_steps"].detach().long().clone()
+
+
+def highest(chosen: Tensor, values: Tensor, count: int) -> Tensor:
+    """The ``count`` rows of ``chosen`` (N,) bool with the highest values (N,); all of them where they are fewer."""
+    index = chosen.nonzero().flatten()
+    if len(index) <= count:
+        return chosen
+    order = values[index].argsort(descending=True, stable=True)
+    limited = torch.zeros_like(chosen)
+    limited[index[order[: max(count, 0)]]] = True
+    return limited
 
 
 def concatenate(parts: tuple[Surfels, ...]) -> Surfels:

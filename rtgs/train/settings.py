@@ -63,7 +63,10 @@ class DensitySettings:
     low_weight_share: float = 0.1  # too large and among the lowest 10 % of mean weight: pruned instead of split
     reset_opacity: float = 0.01
     max_surfels: int = 2_000_000
-    cap_share: float = 0.9  # above this share of max_surfels the lowest mean weights go
+    cap_share: float = 0.9  # above this share of max_surfels (the cap) the lowest mean weights go
+    # Share of the cap that one call may add beyond it, highest signals first, before the lowest weights go. EnvGS has
+    # no such limit and hardly meets its cap of 1.8 million; under a small cap half of the set would change every call.
+    cap_turnover: float = 0.05
 
 
 @dataclass(frozen=True)

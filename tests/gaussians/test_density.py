@@ -133,10 +133,22 @@ def test_too_large_comes_before_high_signal_and_can_be_off():
 
 def test_cap_removes_the_lowest_weights_and_children_inherit_theirs():
     surfels, adam = scene([SMALL] * 6)
-    control = control_of([COLD, COLD, COLD, COLD, HOT, HOT], [5, 1, 4, 2, 3, 0.5], max_surfels=5, cap_share=0.8)
+    control = control_of(
+        [COLD, COLD, COLD, COLD, HOT, HOT], [5, 1, 4, 2, 3, 0.5], max_surfels=5, cap_share=0.8, cap_turnover=1.0
+    )
     report = run(surfels, adam, control)
     assert report == DensityReport(cloned=2, split=0, pruned=4, total=4)
     assert_in_step(surfels, adam, [1, 3, 5], [5])
+
+
+def test_at_the_cap_only_the_highest_signals_grow():
+    """A cap of 4, exceeded by one: of three hot surfels the hottest is cloned, then the lowest weight goes."""
+    surfels, adam = scene([SMALL] * 4)
+    signals = [COLD, HOT, 3 * HOT, 2 * HOT]
+    control = control_of(signals, [1, 4, 3, 2], max_surfels=5, cap_share=0.8, cap_turnover=0.25)
+    report = run(surfels, adam, control)
+    assert report == DensityReport(cloned=1, split=0, pruned=1, total=4)
+    assert_in_step(surfels, adam, [2, 3, 4], [3])
 
 
 def test_cap_leaves_fewer_alone():
