@@ -1,4 +1,4 @@
-"""The graph of a run: import -> one training step per stage -> render -> evaluate -> report.
+"""The graph of a run: import -> one training step per stage (-> mesh) -> render -> evaluate -> report.
 
 Pure: from a config to steps with parameters; nothing runs here. Each step is given only what it reads.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 
-from pipelines import evaluate, import_scene, render, report, train_diffuse
+from pipelines import evaluate, extract_mesh, import_scene, render, report, train_diffuse
 from pipelines.training import StageParams
 from rtgs.config.schema import Choices, RunConfig
 from rtgs.methods import method_stages
@@ -19,10 +19,17 @@ from rtgs.train.settings import MethodSettings, ScheduleSettings
 TRAINING: Mapping[str, StepKind] = {"diffuse": train_diffuse.STEP}
 """The step that runs a stage, by the name the method gives it."""
 
-KINDS: tuple[StepKind, ...] = (import_scene.STEP, *TRAINING.values(), render.STEP, evaluate.STEP, report.STEP)
+KINDS: tuple[StepKind, ...] = (
+    import_scene.STEP,
+    *TRAINING.values(),
+    extract_mesh.STEP,
+    render.STEP,
+    evaluate.STEP,
+    report.STEP,
+)
 """Every kind of step there is; the guard against forgotten version bumps goes through them."""
 
-_NOT_SHOWN = ("paths.", "tracking.", "name", "threads", "scene.path", "method.paper_schedule.")
+_NOT_SHOWN = ("paths.", "tracking.", "name", "threads", "scene.path", "method.paper_schedule.", "ablation.")
 
 
 @dataclass(frozen=True)
@@ -34,6 +41,7 @@ class RunGraph:
     render: Step
     evaluate: Step
     report: Step
+    mesh: Step | None = None
 
     @property
     def targets(self) -> tuple[Step, ...]:
@@ -58,8 +66,10 @@ def build_graph(config: RunConfig, choices: Choices) -> RunGraph:
         rendered,
         tools=_pretrained() if config.evaluation.lpips else (),
     )
-    page = report.STEP.step(_report_params(config, choices), scene, *training, rendered, measured)
-    return RunGraph(scene, training, rendered, measured, page)
+    mesh = extract_mesh.STEP.step(_mesh_params(config), scene, *training) if config.mesh.extract else None
+    made = (rendered, measured) if mesh is None else (mesh, rendered, measured)
+    page = report.STEP.step(_report_params(config, choices), scene, *training, *made)
+    return RunGraph(scene, training, rendered, measured, page, mesh)
 
 
 def _training(config: RunConfig, scene: Step) -> tuple[Step, ...]:
@@ -69,6 +79,11 @@ def _training(config: RunConfig, scene: Step) -> tuple[Step, ...]:
         params = StageParams(method, config.schedule, config.seed, stage.name, stage.from_step, stage.until)
         steps.append(TRAINING[stage.name].step(params, scene, *steps))
     return tuple(steps)
+
+
+def _mesh_params(config: RunConfig) -> extract_mesh.ExtractMeshParams:
+    mesh = config.mesh
+    return extract_mesh.ExtractMeshParams(mesh.tsdf, mesh.only_masked, mesh.depth_ratio, mesh.obj)
 
 
 def _pretrained() -> tuple[tuple[str, str], ...]:
@@ -92,15 +107,15 @@ def method_label(choices: Choices) -> str:
 
 def _report_params(config: RunConfig, choices: Choices) -> report.ReportParams:
     values, defaults = shown_values(config), shown_values(RunConfig())
-    lines = tuple((key, str(values[key]), str(defaults.get(key, ""))) for key in sorted(values))
+    lines = {key: (str(values[key]), str(defaults.get(key, ""))) for key in sorted(values)}
     title = f"{config.scene.name}: {method_label(choices)}, {choices.preset}"
     return report.ReportParams(title, command(choices), lines)
 
 
 def shown_values(config: RunConfig) -> dict[str, object]:
     """Every value that has to do with the result, by dotted key."""
-    values = flatten(asdict(config))
-    return {key: value for key, value in values.items() if not key.startswith(_NOT_SHOWN)}
+    hidden = _NOT_SHOWN if config.mesh.extract else (*_NOT_SHOWN, "mesh.")
+    return {key: value for key, value in flatten(asdict(config)).items() if not key.startswith(hidden)}
 
 
 def command(choices: Choices) -> str:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipelines import extract_mesh
 from pipelines.evaluate import TABLE_JSON
 from pipelines.render import read_render
 from pipelines.training import last_training, read_history, read_summary
@@ -17,7 +19,7 @@ from rtgs.pipeline.manifest import Manifest
 if TYPE_CHECKING:
     from rtgs.evaluate.evaluate import EvaluationTable
     from rtgs.report.figures import Curve
-    from rtgs.report.page import ReportView, StepLine
+    from rtgs.report.page import MeshFigure, ReportView, StepLine
 
 PAGE = "report.html"
 
@@ -28,8 +30,8 @@ class ReportParams:
 
     title: str
     command: str
-    config: tuple[tuple[str, str, str], ...]
-    """(key, value, default) of every config value that has to do with the result."""
+    config: dict[str, tuple[str, str]]
+    """Value and default of every config key that has to do with the result."""
     views: int = 4
     """How many test views are shown: the best, the worst, and evenly between."""
 
@@ -55,8 +57,9 @@ def report(params: ReportParams, context: StepContext) -> None:
         curves=_curves(inputs),
         steps=_steps(context),
         decisions=tuple(decisions),
-        config=tuple(ConfigLine(*line) for line in params.config),
+        config=tuple(ConfigLine(key, *both) for key, both in sorted(params.config.items())),
         machine={key: str(value) for key, value in (manifest.machine | manifest.versions).items()},
+        mesh=_mesh(inputs["extract_mesh"]) if "extract_mesh" in inputs else None,
     )
     size = write_report(context.out / PAGE, data)
     context.log.info("report of %.1f MB", size / 1e6)
@@ -76,6 +79,18 @@ def _views(table: EvaluationTable, inputs: Mapping[str, Path], count: int) -> tu
         shown = {key: maps.get(key) for key in ("depth", "normal", "alpha")}
         views.append(ReportView(name, photo.camera, photo.image, maps["image"], role, **shown))
     return tuple(views)
+
+
+def _mesh(folder: Path) -> MeshFigure:
+    import numpy as np
+    from PIL import Image
+
+    from rtgs.report.page import MeshFigure
+
+    record = json.loads((folder / extract_mesh.SUMMARY_FILE).read_text(encoding="utf-8"))
+    pixels = np.asarray(Image.open(folder / extract_mesh.PICTURE_FILE).convert("RGB"))
+    note = f"Voxel {record['voxel']:.4g}, depths up to {record['depth_trunc']:.4g}, seen from {record['picture_from']}."
+    return MeshFigure(pixels, record["vertices"], record["faces"], note)
 
 
 def _curves(inputs: Mapping[str, Path]) -> tuple[Curve, ...]:

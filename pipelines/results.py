@@ -49,7 +49,7 @@ def write_run_folder(config: RunConfig, choices: Choices, command: str, results:
     """Copy what people look at into ``runs/<name>``; nothing is copied when it is all there already.
 
     ``report.html``, ``metrics.json``, ``metrics.csv``, ``renders/``, ``errors/``, ``point_cloud.ply`` (the base set;
-    other sets under their own names), ``config.yaml``, ``run.json``.
+    other sets under their own names), ``mesh.ply`` when asked for, ``config.yaml``, ``run.json``.
     """
     folder = config.paths.runs / str(config.name)
     steps = {result.step.name: result.step.fingerprint for result in results}
@@ -66,7 +66,7 @@ def write_run_folder(config: RunConfig, choices: Choices, command: str, results:
     _replace_tree(places["evaluate"] / "errors", folder / "errors")
     for ply in sorted(final_training(results).glob("*.ply")):
         shutil.copyfile(ply, folder / ("point_cloud.ply" if ply.stem == "base" else ply.name))
-    for mesh in sorted(places["extract_mesh"].glob("*.ply")) if "extract_mesh" in places else ():
+    for mesh in sorted(places["extract_mesh"].glob("mesh.*")) if "extract_mesh" in places else ():
         shutil.copyfile(mesh, folder / mesh.name)
     (folder / "config.yaml").write_text(config_yaml(config), encoding="utf-8")
     finished = datetime.now(UTC).isoformat(timespec="seconds")

@@ -114,8 +114,13 @@ def friendly_overrides(arguments: Sequence[str]) -> list[str]:
             rewritten.append(argument)
     keys = {argument.partition("=")[0] for argument in rewritten}
     if "scene.path" in keys and "scene" not in keys:
-        rewritten.insert(0, "scene=capture")
-    return rewritten
+        rewritten.append("scene=capture")
+    options = [argument for argument in rewritten if not _is_override(argument)]
+    return options + [argument for argument in rewritten if _is_override(argument)]  # argparse wants them in one piece
+
+
+def _is_override(argument: str) -> bool:
+    return argument.startswith("~") or ("=" in argument and not argument.startswith("-"))
 
 
 def _quoted(text: str) -> str:
@@ -126,7 +131,7 @@ def _quoted(text: str) -> str:
 class HydraApp:
     """The task function behind Hydra.
 
-    Keeps the error of a single run, so that Hydra adds nothing to it, and what the jobs of a sweep in this process gave.
+    Keeps the error of a single run, so that Hydra adds nothing to it, and the outcomes of a sweep in this process.
     """
 
     def __init__(self) -> None:

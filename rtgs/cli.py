@@ -43,6 +43,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if command is None:
         print(f"rtgs: unknown command {words[0]!r}\n\n{USAGE}", file=sys.stderr)
         return 2
+    # Threads of OpenMP that wait by spinning starve each other as soon as a machine has anything else to do (measured:
+    # ten times slower under load); must be set before torch is loaded.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     try:
         return command(words[1:])
     except KeyboardInterrupt:

@@ -9,6 +9,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from rtgs.mesh.tsdf import TsdfSettings
 from rtgs.scenes.settings import SceneSettings
 from rtgs.train.settings import MethodSettings, ScheduleSettings
 
@@ -62,6 +63,21 @@ class EvaluationConfig:
 
 
 @dataclass(frozen=True)
+class MeshConfig:
+    """The mesh step (methods.md 6.3)."""
+
+    extract: bool = False
+    """Run it: fuse the depths of the training views into a mesh."""
+    only_masked: bool = False
+    """Only what lies inside the scene's masks: the glass object instead of the scene."""
+    depth_ratio: float = 0.0
+    """0: expected depth (2DGS for meshes of real scenes), 1: median depth."""
+    obj: bool = False
+    """Also write an OBJ file."""
+    tsdf: TsdfSettings = field(default_factory=TsdfSettings)
+
+
+@dataclass(frozen=True)
 class Choices:
     """The files chosen from the config groups: names for tables, folders and the report."""
 
@@ -84,6 +100,7 @@ class RunConfig:
     method: MethodSettings = field(default_factory=MethodSettings)
     schedule: ScheduleSettings = field(default_factory=ScheduleSettings)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    mesh: MeshConfig = field(default_factory=MeshConfig)
     ablation: AblationConfig = field(default_factory=AblationConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     paths: PathsConfig = field(default_factory=PathsConfig)
@@ -93,8 +110,6 @@ class RunConfig:
     """Folder under ``<root>/runs``. None: scene, method, preset, ablation and seed."""
     threads: int | None = None
     """Threads of torch and the native core. None: torch's default."""
-    mesh: bool = False
-    """Also extract a mesh from the trained surfels."""
 
 
 def open_schema(cls: type) -> type:

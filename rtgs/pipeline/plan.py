@@ -11,6 +11,9 @@ from rtgs.pipeline.manifest import Manifest
 from rtgs.pipeline.step import Step
 from rtgs.pipeline.store import Store
 
+_REASONS = 3  # differences told for one step
+_VALUE_LENGTH = 40
+
 
 @dataclass(frozen=True)
 class PlannedStep:
@@ -87,7 +90,10 @@ def explain_miss(step: Step, manifests: Sequence[Manifest]) -> str:
     if not manifests:
         return "never ran here"
     nearest = min((differences(step, manifest) for manifest in manifests), key=len)
-    return ", ".join(nearest) if nearest else "its artifact is broken"
+    if not nearest:
+        return "its artifact is broken"
+    rest = len(nearest) - _REASONS
+    return ", ".join(nearest[:_REASONS]) + (f" and {rest} more" if rest > 0 else "")
 
 
 def differences(step: Step, manifest: Manifest) -> list[str]:
@@ -95,18 +101,23 @@ def differences(step: Step, manifest: Manifest) -> list[str]:
     found = []
     if manifest.version != step.version:
         found.append(f"step version: {manifest.version} -> {step.version}")
-    found += _changes(flatten(manifest.params), flatten(step.recipe))
-    found += _changes(dict(manifest.tools), dict(step.tools))
     upstream = {other.name: other.fingerprint for other in step.upstream}
     for name in sorted(upstream.keys() | manifest.upstream.keys()):
         if upstream.get(name) != manifest.upstream.get(name):
             found.append(f"upstream {name} changed")
+    found += _changes(flatten(manifest.params), flatten(step.recipe))
+    found += _changes(dict(manifest.tools), dict(step.tools))
     return found
 
 
 def _changes(old: dict[str, object], new: dict[str, object]) -> list[str]:
     return [
-        f"{key}: {old.get(key, 'absent')} -> {new.get(key, 'absent')}"
+        f"{key}: {_short(old.get(key, 'absent'))} -> {_short(new.get(key, 'absent'))}"
         for key in sorted(old.keys() | new.keys())
         if key not in old or key not in new or old[key] != new[key]
     ]
+
+
+def _short(value: object) -> str:
+    text = str(value)
+    return text if len(text) <= _VALUE_LENGTH else f"{text[: _VALUE_LENGTH - 3]}..."

@@ -1,0 +1,238 @@
+"""The whole chain on a capture of a few tiny pictures, through the command line."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+
+from pipelines.run import friendly_overrides
+from rtgs.cli import main
+from rtgs.pipeline import Store
+
+WIDTH, HEIGHT, VIEWS = 32, 24, 10
+QUICK = (
+    "preset=smoke",
+    "scene.long_side=32",
+    "scene.points=random",
+    "scene.random_points=200",
+    "schedule.total=12",
+    "schedule.checkpoint_every=6",
+    "schedule.densify_every=5",
+    "tracking=off",
+    "threads=1",
+)
+
+
+def pose(index: int) -> list[list[float]]:
+    """Camera to world (OpenGL axes) on a ring around the origin, looking at it."""
+    angle = 2 * math.pi * index / VIEWS
+    backward = np.array([math.cos(angle), 0.2, math.sin(angle)])
+    backward /= np.linalg.norm(backward)
+    right = np.cross([0.0, 1.0, 0.0], backward)
+    right /= np.linalg.norm(right)
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.stack([right, np.cross(backward, right), backward], axis=1)
+    matrix[:3, 3] = 3 * backward
+    return matrix.tolist()
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory) -> Path:
+    """A nerfstudio capture of ten pictures."""
+    folder = tmp_path_factory.mktemp("captures") / "tiny room"
+    (folder / "images").mkdir(parents=True)
+    frames = []
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH]
+    for index in range(VIEWS):
+        picture = np.stack([128 + 90 * np.sin(x / 5 + index), 128 + 90 * np.cos(y / 4), 100 + x], axis=-1)
+        Image.fromarray(picture.clip(0, 255).astype(np.uint8)).save(folder / "images" / f"{index:03d}.png")
+        frames.append({"file_path": f"images/{index:03d}.png", "transform_matrix": pose(index)})
+    shared = {"w": WIDTH, "h": HEIGHT, "fl_x": 30.0, "fl_y": 30.0, "cx": 16.0, "cy": 12.0, "camera_model": "PINHOLE"}
+    (folder / "transforms.json").write_text(json.dumps(shared | {"frames": frames}))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("root")
+
+
+@pytest.fixture(autouse=True)
+def _in_root(root, monkeypatch):
+    """Commands run as from an empty folder; the loggers Hydra sets up are put back."""
+    monkeypatch.chdir(root)
+    monkeypatch.setenv("RTGS_ROOT", str(root))
+    monkeypatch.delenv("RTGS_DEBUG", raising=False)
+    handlers, level = logging.root.handlers[:], logging.root.level
+    yield
+    logging.root.handlers[:], logging.root.level = handlers, level
+
+
+@pytest.fixture(scope="module")
+def words(capture) -> list[str]:
+    return ["run", f"scene={capture}", "method=2dgs", *QUICK]
+
+
+@pytest.fixture(scope="module")
+def first(root, words) -> Path:
+    """The run folder of a first run."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(root)
+        patch.setenv("RTGS_ROOT", str(root))
+        assert main(words) == 0
+    return root / "runs" / "tiny_room-2dgs-smoke"
+
+
+def test_a_run_leaves_what_people_look_at(first):
+    names = {path.name for path in first.iterdir()}
+    expected = {"report.html", "metrics.json", "metrics.csv", "point_cloud.ply", "config.yaml", "run.json", "renders"}
+    assert expected <= names
+    assert len(list((first / "renders").glob("*.png"))) == 2  # views 0 and 8 of 10
+    assert yaml.safe_load((first / "config.yaml").read_text())["schedule"]["total"] == 12
+    table = json.loads((first / "metrics.json").read_text())
+    assert table["facts"]["steps"] == 12
+    assert table["mean"]["psnr"] > 5
+    assert (first / "report.html").read_text().lstrip().lower().startswith("<!doctype html>")
+
+
+def test_a_second_run_only_reads_the_cache_and_says_so(first, words, capsys):
+    before = (first / "run.json").stat().st_mtime_ns
+    assert main(words) == 0
+    captured = capsys.readouterr()
+    assert "5 steps, 5 from the cache, nothing to do" in captured.err
+    assert "tiny_room" in captured.out
+    assert "report: runs/tiny_room-2dgs-smoke/report.html" in captured.out
+    assert (first / "run.json").stat().st_mtime_ns == before
+
+
+def test_the_plan_tells_why(first, words, capsys):
+    assert main(["plan", *words[1:], "ablation=no_normal_loss"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1].split()[0::2][:2] == ["import_scene", "cached"]
+    assert "to run  method.loss.normal: 0.05 -> 0.0" in lines[2]
+    assert "upstream train_diffuse changed" in lines[3]
+    assert lines[-1] == "5 steps, 1 from the cache"
+
+
+def test_the_report_is_found_and_comes_back_from_the_store(first, capsys):
+    assert main(["report"]) == 0
+    (first / "report.html").unlink()
+    assert main(["report", "tiny_room-2dgs-smoke"]) == 0
+    shown = capsys.readouterr().out.split()
+    assert [Path(line).resolve() for line in shown] == [(first / "report.html").resolve()] * 2
+    assert (first / "report.html").is_file()
+    assert main(["report", "nothing"]) == 1
+    assert "no finished run 'nothing'" in capsys.readouterr().err
+
+
+def test_the_cache_is_listed_and_sound(first, root, capsys):
+    assert main(["cache", "ls"]) == 0
+    listed = capsys.readouterr().out
+    for name in ("import_scene", "train_diffuse", "render", "evaluate", "report"):
+        assert name in listed
+    assert main(["cache", "verify"]) == 0
+    (folder,) = (artifact.folder for artifact in Store(root / "store").artifacts("evaluate"))
+    content = (folder / "metrics.csv").read_bytes()
+    (folder / "metrics.csv").write_bytes(content.replace(b"2dgs", b"3dgs", 1))
+    assert main(["cache", "verify"]) == 1
+    assert "metrics.csv has changed" in capsys.readouterr().out
+    (folder / "metrics.csv").write_bytes(content)
+    assert main(["cache", "gc"]) == 0
+    assert "removed 0 folders" in capsys.readouterr().out
+
+
+def test_a_mesh_on_request(words, first, root):
+    assert main([*words, "mesh.extract=true", "mesh.tsdf.resolution=64", "name=meshed"]) == 0
+    assert (root / "runs" / "meshed" / "mesh.ply").is_file()
+    assert "Mesh" in (root / "runs" / "meshed" / "report.html").read_text()
+    assert len(list(Store(root / "store").artifacts("train_diffuse"))) == 1
+
+
+def test_sweeps_share_steps_and_end_with_a_table(words, first, root, capsys):
+    assert main([*words, "--multirun", "ablation=none,no_normal_loss"]) == 0
+    captured = capsys.readouterr()
+    assert len(list(Store(root / "store").artifacts("import_scene"))) == 1
+    assert len(list(Store(root / "store").artifacts("train_diffuse"))) == 2
+    table = captured.out.strip().splitlines()
+    assert table[-2].split()[:2] == ["tiny_room", "2dgs"]
+    assert "2dgs, no_normal_loss" in table[-1]
+
+
+def test_a_failing_job_does_not_stop_the_others(words, first, capsys):
+    assert main([*words, "--multirun", "schedule.densify_every=0,5"]) == 1
+    captured = capsys.readouterr()
+    assert "1 of 2 jobs failed" in captured.out
+    assert "schedule.densify_every is 0" in captured.err
+    assert "report: runs/tiny_room-2dgs-smoke" in captured.out
+
+
+@pytest.mark.parametrize(
+    ("override", "expected"),
+    [
+        ("method.los.l1=1", ["Key 'los'", "Did you mean loss?"]),
+        ("scene.path=/no/such/folder", ["capture folder /no/such/folder does not exist"]),
+        ("threads=0", ["threads=0 must be at least 1"]),
+        ("method.name=3dgs", ["method.name is '3dgs'", "2dgs"]),
+    ],
+)
+def test_mistakes_are_one_message_without_traceback(words, override, expected, capsys):
+    assert main([*words, override]) == 1
+    errors = capsys.readouterr().err
+    for text in expected:
+        assert text in errors
+    assert "Traceback" not in errors
+
+
+def test_debug_shows_the_traceback(words, monkeypatch, capsys):
+    monkeypatch.setenv("RTGS_DEBUG", "1")
+    assert main([*words, "threads=0"]) == 1
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_check_tells_whether_a_capture_can_be_trained_on(capture, tmp_path, capsys):
+    assert main(["check", str(capture), "scene.points=random"]) == 0
+    assert "ready for training" in capsys.readouterr().out
+    assert main(["check", str(tmp_path)]) == 1
+    assert "is no capture" in capsys.readouterr().out
+
+
+def test_weights_are_listed_and_never_fetched(capsys):
+    assert main(["weights"]) == 0
+    listed = capsys.readouterr().out
+    for text in ("vgg16", "sha256", "licence", "RTGS_WEIGHTS"):
+        assert text in listed
+
+
+def test_a_folder_is_as_good_as_a_scene(capture, monkeypatch):
+    path = f"scene.path='{capture}'"
+    assert friendly_overrides([f"scene={capture}", "-m", "seed=1"]) == ["-m", "scene=capture", path, "seed=1"]
+    assert friendly_overrides([f"scene.path={capture}", "--cfg", "job"]) == ["--cfg", "job", path, "scene=capture"]
+    assert friendly_overrides(["scene=fox", f"scene.path={capture}"]) == ["scene=fox", path]
+    assert friendly_overrides(["scene=fox,bonsai"]) == ["scene=fox,bonsai"]
+    monkeypatch.chdir(capture.parent)
+    assert friendly_overrides(["scene=tiny room"]) == ["scene=capture", "scene.path='tiny room'"]
+
+
+def test_help_and_unknown_commands(capsys):
+    assert main(["--help"]) == 0
+    assert "rtgs run" in capsys.readouterr().out
+    assert main(["fly"]) == 2
+    assert "unknown command 'fly'" in capsys.readouterr().err
+
+
+def test_the_module_is_the_same_as_the_command(first, words, root):
+    code = [sys.executable, "-m", "pipelines.run", *words[1:]]
+    result = subprocess.run(code, capture_output=True, text=True, check=True)
+    assert "nothing to do" in result.stderr
+    result = subprocess.run([*code[:3], "--help"], capture_output=True, text=True, check=True)
+    for text in ("method: 2dgs", "rtgs run scene.path=", "preset: "):
+        assert text in result.stdout
