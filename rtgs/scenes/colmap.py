@@ -68,7 +68,7 @@ def read_colmap(settings: SceneSettings, root: Path) -> Capture:
         views=views,
         points=_points(model, settings, folder / f"points3D{suffix}"),
         model_files=tuple(part for part in parts if part.is_file()),
-        findings=tuple(_unused_images(images_dir, registered, unregistered) + _other_models(folder)),
+        findings=tuple(_unused_images(images_dir, root, registered, unregistered) + _other_models(folder)),
     )
 
 
@@ -178,10 +178,11 @@ def _points(model: Any, settings: SceneSettings, source: Path) -> PointCloud:
     )
 
 
-def _unused_images(images_dir: Path, registered: list[Any], unregistered: list[str]) -> list[Finding]:
+def _unused_images(images_dir: Path, root: Path, registered: list[Any], unregistered: list[str]) -> list[Finding]:
+    """Photos without a pose. Where the capture's root itself is the photo folder, only those the model lists."""
     known = {image.name for image in registered}
     on_disk = []
-    if images_dir.is_dir():
+    if images_dir.is_dir() and images_dir != root:
         for folder, _, files in os.walk(images_dir):
             relative = Path(folder).relative_to(images_dir)
             on_disk += [(relative / f).as_posix() for f in files if Path(f).suffix.lower() in IMAGE_SUFFIXES]

@@ -34,7 +34,8 @@ def read_photo(
 ) -> np.ndarray:
     """Read a photo as (H, W, 3) float32 in 0..1, sRGB encoding untouched.
 
-    8 and 16 bit, grey, palette and CMYK are converted; an alpha channel (straight) is composited on ``background``.
+    8 and 16 bit, grey, palette and CMYK are converted (of 16-bit colour Pillow keeps the upper 8 bits; 16-bit grey is
+    read in full); an alpha channel (straight) is composited on ``background``.
     ``expected`` is the camera's (width, height). Poses refer to pixels as stored, so EXIF orientation is *not* applied,
     except where only the turned photo has the camera's aspect ratio (tools that turn photos before matching).
 

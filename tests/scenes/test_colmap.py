@@ -166,6 +166,16 @@ def test_turned_photos_are_turned_only_where_the_camera_says_so(tmp_path):
         np.testing.assert_allclose(views[name].image.permute(1, 2, 0).numpy(), upright / 255, atol=1e-6)
 
 
+def test_names_that_include_the_image_folder(tmp_path):
+    names = [f"images/photo_{index:02d}.png" for index in range(10)]
+    root = ColmapCapture(tmp_path, images_dir=".", names=names, points=120).write()
+    save_image(root / "masks/photo_01.png", np.ones((HEIGHT, WIDTH), dtype=np.uint8))
+    save_image(root / "masks/images/photo_02.png", np.ones((HEIGHT, WIDTH), dtype=np.uint8))
+    scene = load(root)
+    assert [view.name for view in scene.train if view.mask is not None] == names[1:3]
+    assert read_colmap(SceneSettings(path=str(root)), root).findings == ()
+
+
 def test_two_models_and_unregistered_photos_are_mentioned(tmp_path):
     root = ColmapCapture(tmp_path).write()
     shutil.copytree(root / "sparse/0", root / "sparse/1")
