@@ -120,7 +120,7 @@ def _read_vertices(path: Path) -> plyfile.PlyElement:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     try:
-        ply = plyfile.PlyData.read(str(path), mmap=False)
+        ply = plyfile.PlyData.read(str(path))
     except (plyfile.PlyHeaderParseError, UnicodeDecodeError) as error:
         raise ValueError(f"{path} is not a PLY file: {error}") from error
     except (plyfile.PlyParseError, ValueError, MemoryError, OverflowError) as error:

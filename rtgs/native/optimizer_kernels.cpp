@@ -70,12 +70,19 @@ inline long update_chunk(const AdamTensor& t, long chunk, const AdamSettings& s)
   return bad;
 }
 
+// Waking a thread costs more than a few chunks.
+inline int useful_threads(long chunks, int threads) {
+  const long most = 1 + chunks / 8;
+  return most < threads ? int(most) : threads;
+}
+
 }  // namespace
 
 long adam_step(const AdamTensor* tensors, int count, const AdamSettings& s) {
   long chunks = 0, bad = 0;
   for (int k = 0; k < count; ++k) chunks += chunk_total(tensors[k]);
-#pragma omp parallel for schedule(static) num_threads(s.threads) reduction(+ : bad) if (s.threads > 1)
+  const int threads = useful_threads(chunks, s.threads);
+#pragma omp parallel for schedule(static) num_threads(threads) reduction(+ : bad) if (threads > 1)
   for (long chunk = 0; chunk < chunks; ++chunk) {
     long local = chunk;
     int k = 0;
@@ -88,6 +95,7 @@ long adam_step(const AdamTensor* tensors, int count, const AdamSettings& s) {
 long count_nonfinite(const float* values, long count, int threads) {
   long bad = 0;
   const long chunks = (count + kChunk - 1) / kChunk;
+  threads = useful_threads(chunks, threads);
 #pragma omp parallel for schedule(static) num_threads(threads) reduction(+ : bad) if (threads > 1)
   for (long chunk = 0; chunk < chunks; ++chunk) {
     const float* p = values + chunk * kChunk;

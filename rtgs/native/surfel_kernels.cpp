@@ -219,10 +219,17 @@ void backward_tail(const ActivationShape& shape, const RawSurfels& in, const flo
   copy(out.sh_rest, to.sh_rest, rows, 3 * shape.rest);
 }
 
+// Waking a thread costs about as much as this many surfels.
+inline int useful_threads(const ActivationShape& shape) {
+  const long most = 1 + shape.count / 2048;
+  return most < shape.threads ? int(most) : shape.threads;
+}
+
 template <int Degree>
 void forward(const ActivationShape& shape, const RawSurfels& in, const Activated& out, float* saved) {
   const long blocks = (shape.count + kLanes - 1) / kLanes;
-#pragma omp parallel for schedule(static) num_threads(shape.threads) if (shape.threads > 1)
+  const int threads = useful_threads(shape);
+#pragma omp parallel for schedule(static) num_threads(threads) if (threads > 1)
   for (long block = 0; block < blocks; ++block) {
     const long i = block * kLanes;
     const RawSurfels from = rows_from(in, i, shape.rest);
@@ -241,7 +248,8 @@ template <int Degree>
 void backward(const ActivationShape& shape, const RawSurfels& in, const float* scales, const float* opacities,
               const float* saved, const ActivatedGradients& up, const RawGradients& out) {
   const long blocks = (shape.count + kLanes - 1) / kLanes;
-#pragma omp parallel for schedule(static) num_threads(shape.threads) if (shape.threads > 1)
+  const int threads = useful_threads(shape);
+#pragma omp parallel for schedule(static) num_threads(threads) if (threads > 1)
   for (long block = 0; block < blocks; ++block) {
     const long i = block * kLanes;
     const RawSurfels from = rows_from(in, i, shape.rest);

@@ -27,7 +27,7 @@ def assert_same_bits(a: Surfels, b: Surfels) -> None:
 
 
 def read_vertices(path: Path) -> np.ndarray:
-    return plyfile.PlyData.read(str(path), mmap=False)["vertex"].data
+    return plyfile.PlyData.read(str(path))["vertex"].data.copy()
 
 
 def rewrite(path: Path, change) -> None:
