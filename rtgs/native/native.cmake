@@ -6,7 +6,11 @@ set(RTGS_KERNELS
   normal_kernels.cpp
   surfel_kernels.cpp
   optimizer_kernels.cpp
-  raster_kernels.cpp)
+  project_kernels.cpp
+  project_backward.cpp
+  raster_bins.cpp
+  raster_forward.cpp
+  raster_backward.cpp)
 set(RTGS_BINDINGS
   module.cpp
   isa.cpp

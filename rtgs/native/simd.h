@@ -56,6 +56,9 @@ static inline vint truncate(vfloat a) { return __builtin_convertvector(a, vint);
 static inline vmask ge(vfloat a, vfloat b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_GE_OQ); }
 static inline vmask gt(vfloat a, vfloat b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_GT_OQ); }
 static inline vmask eq(vfloat a, vfloat b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_EQ_OQ); }
+static inline vmask eq_int(vint a, vint b) { return _mm512_cmpeq_epi32_mask((__m512i)a, (__m512i)b); }
+static inline vmask gt_int(vint a, vint b) { return _mm512_cmpgt_epi32_mask((__m512i)a, (__m512i)b); }
+static inline vint select_int(vmask m, vint a, vint b) { return (vint)_mm512_mask_blend_epi32(m, (__m512i)b, (__m512i)a); }
 static inline vmask mask_not(vmask m) { return vmask(~m); }
 static inline bool any(vmask m) { return m != 0; }
 static inline uint32_t mask_bits(vmask m) { return m; }
@@ -66,6 +69,8 @@ static inline vfloat min(vfloat a, vfloat b) { return (vfloat)_mm512_min_ps((__m
 static inline vfloat max(vfloat a, vfloat b) { return (vfloat)_mm512_max_ps((__m512)a, (__m512)b); }
 static inline vfloat fma(vfloat a, vfloat b, vfloat c) { return (vfloat)_mm512_fmadd_ps((__m512)a, (__m512)b, (__m512)c); }
 static inline vfloat round(vfloat a) { return (vfloat)_mm512_roundscale_ps((__m512)a, 8); }
+static inline vfloat floor(vfloat a) { return (vfloat)_mm512_roundscale_ps((__m512)a, 9); }
+static inline vfloat fraction(vfloat a) { return (vfloat)_mm512_reduce_ps((__m512)a, 1); }  // a - floor(a)
 static inline vfloat sqrt(vfloat a) { return (vfloat)_mm512_sqrt_round_ps((__m512)a, 8); }
 static inline vfloat scale_by_power(vfloat a, vfloat n) { return (vfloat)_mm512_scalef_ps((__m512)a, (__m512)n); }
 static inline vfloat gather(const float* p, vint index) { return (vfloat)_mm512_i32gather_ps((__m512i)index, p, 4); }
@@ -83,6 +88,9 @@ static inline vfloat reciprocal(vfloat a) {
 static inline vmask ge(vfloat a, vfloat b) { return (vmask)_mm256_cmp_ps((__m256)a, (__m256)b, _CMP_GE_OQ); }
 static inline vmask gt(vfloat a, vfloat b) { return (vmask)_mm256_cmp_ps((__m256)a, (__m256)b, _CMP_GT_OQ); }
 static inline vmask eq(vfloat a, vfloat b) { return (vmask)_mm256_cmp_ps((__m256)a, (__m256)b, _CMP_EQ_OQ); }
+static inline vmask eq_int(vint a, vint b) { return a == b; }
+static inline vmask gt_int(vint a, vint b) { return a > b; }
+static inline vint select_int(vmask m, vint a, vint b) { return (a & m) | (b & ~m); }
 static inline vmask mask_not(vmask m) { return ~m; }
 static inline bool any(vmask m) { return _mm256_movemask_ps((__m256)m) != 0; }
 static inline uint32_t mask_bits(vmask m) { return uint32_t(_mm256_movemask_ps((__m256)m)); }
@@ -93,6 +101,8 @@ static inline vfloat min(vfloat a, vfloat b) { return (vfloat)_mm256_min_ps((__m
 static inline vfloat max(vfloat a, vfloat b) { return (vfloat)_mm256_max_ps((__m256)a, (__m256)b); }
 static inline vfloat fma(vfloat a, vfloat b, vfloat c) { return (vfloat)_mm256_fmadd_ps((__m256)a, (__m256)b, (__m256)c); }
 static inline vfloat round(vfloat a) { return (vfloat)_mm256_round_ps((__m256)a, 8); }
+static inline vfloat floor(vfloat a) { return (vfloat)_mm256_round_ps((__m256)a, 9); }
+static inline vfloat fraction(vfloat a) { return a - floor(a); }
 static inline vfloat sqrt(vfloat a) { return (vfloat)_mm256_sqrt_ps((__m256)a); }
 static inline vfloat scale_by_power(vfloat a, vfloat n) {  // n whole; result a 2^n for n in [-126, 127]
   __m256i e = _mm256_slli_epi32(_mm256_cvtps_epi32((__m256)n), 23);
@@ -112,6 +122,9 @@ static inline vfloat reciprocal(vfloat a) { return 1.f / a; }
 static inline vmask ge(vfloat a, vfloat b) { return a >= b; }
 static inline vmask gt(vfloat a, vfloat b) { return a > b; }
 static inline vmask eq(vfloat a, vfloat b) { return a == b; }
+static inline vmask eq_int(vint a, vint b) { return a == b; }
+static inline vmask gt_int(vint a, vint b) { return a > b; }
+static inline vint select_int(vmask m, vint a, vint b) { return (a & m) | (b & ~m); }
 static inline vmask mask_not(vmask m) { return ~m; }
 static inline bool any(vmask m) { return (m[0] | m[1] | m[2] | m[3]) != 0; }
 static inline uint32_t mask_bits(vmask m) {
@@ -126,6 +139,11 @@ static inline vfloat fma(vfloat a, vfloat b, vfloat c) { return a * b + c; }  //
 static inline vfloat round(vfloat a) {                                       // |a| < 2^31; halves away from zero
   return to_float(truncate(a + select(a >= broadcast(0.f), broadcast(0.5f), broadcast(-0.5f))));
 }
+static inline vfloat floor(vfloat a) {  // |a| < 2^31
+  vfloat whole = to_float(truncate(a));
+  return whole - where(whole > a, broadcast(1.f));
+}
+static inline vfloat fraction(vfloat a) { return a - floor(a); }
 static inline vfloat sqrt(vfloat a) {
   for (int lane = 0; lane < kLanes; ++lane) a[lane] = __builtin_sqrtf(a[lane]);
   return a;
@@ -171,6 +189,22 @@ static inline vfloat exp(vfloat a) {
 }
 static inline vfloat sigmoid(vfloat a) { return 1.f / (1.f + exp(-a)); }
 
+// True where a is neither NaN nor infinite (on the bits: fast-math cannot fold it).
+static inline vmask finite(vfloat a) { return gt_int(broadcast_int(0x7f800000), (vint)a & 0x7fffffff); }
+
+// log2(a) for normal positive a, error <= 1e-7 of max(1, |result|).
+static inline vfloat log2(vfloat a) {
+  vint bits = (vint)a, exponent = (bits - 0x3f3504f3) >> 23;  // mantissa in [sqrt(1/2), sqrt(2))
+  vfloat m = (vfloat)(bits - (exponent << 23));
+  vfloat s = (m - 1.f) / (m + 1.f), q = s * s;  // log2(m) = 2 log2(e) artanh(s)
+  vfloat p = broadcast(0.32059889f);
+  p = fma(p, q, broadcast(0.41219859f));
+  p = fma(p, q, broadcast(0.57707802f));
+  p = fma(p, q, broadcast(0.96179669f));
+  p = fma(p, q, broadcast(2.88539008f));
+  return fma(p, s, to_float(exponent));
+}
+
 // ---- horizontal sums -------------------------------------------------------------------------------------------
 template <int...>
 struct LaneList {};
@@ -181,21 +215,24 @@ struct MakeLanes<0, I...> {
   typedef LaneList<I...> type;
 };
 
-// Sums neighbouring groups of S lanes: groups of a come out as the first halves, groups of b as the second ones.
-template <int S, int... I>
-static inline vfloat add_groups(vfloat a, vfloat b, LaneList<I...>) {
-  constexpr auto lane = [](int i, int half) {  // the lane of (a, b) that lands in lane i
-    return (i % (2 * S) < S ? 0 : kLanes - S) + i + half * S;
-  };
+// From every group of 2 S lanes the first (Half 0) or second (Half 1) S lanes: of a into the first half of the result's
+// group, of b into its second half.
+template <int S, int Half, int... I>
+static inline vfloat zip_groups(vfloat a, vfloat b, LaneList<I...>) {
+  constexpr auto lane = [](int i) { return (i % (2 * S) < S ? 0 : kLanes - S) + i + Half * S; };
 #if defined(__clang__)
-  return __builtin_shufflevector(a, b, lane(I, 0)...) + __builtin_shufflevector(a, b, lane(I, 1)...);
+  return __builtin_shufflevector(a, b, lane(I)...);
 #else
-  return __builtin_shuffle(a, b, vint{lane(I, 0)...}) + __builtin_shuffle(a, b, vint{lane(I, 1)...});
+  return __builtin_shuffle(a, b, vint{lane(I)...});
 #endif
+}
+template <int S, int Half>
+static inline vfloat zip_groups(vfloat a, vfloat b) {
+  return zip_groups<S, Half>(a, b, typename MakeLanes<kLanes>::type{});
 }
 template <int S>
 static inline vfloat add_groups(vfloat a, vfloat b) {
-  return add_groups<S>(a, b, typename MakeLanes<kLanes>::type{});
+  return zip_groups<S, 0>(a, b) + zip_groups<S, 1>(a, b);
 }
 
 // Transpose and add: lane k of the result is the sum over the lanes of v[k], k = 0 .. kLanes - 1, in a fixed order.

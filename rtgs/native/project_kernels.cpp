@@ -1,0 +1,151 @@
+// World to screen: one record, one tile rectangle and one depth per surfel.
+#include "project_geometry.h"
+
+namespace rtgs::RTGS_ISA {
+namespace {
+
+// Where a surfel can show: an axis-aligned box and, for the test of a block of pixels, its ellipse in conditional form.
+struct ScreenBound {
+  vfloat left, right, top, bottom;  // pixels
+  vfloat centre_x, centre_y, slope_y, slope_x, inv_x2, inv_y2_given_x, inv_y2, inv_x2_given_y, disc2;
+};
+
+// The circle u^2 + v^2 <= reach maps to an ellipse while it stays in front of the camera plane; its dual conic needs
+// no inverse of A. Squared half-widths grow a little so that rounding never loses a pixel. Circles that meet the
+// camera plane have no ellipse: the bound is the whole screen and every block passes the test.
+ScreenBound screen_bound(const RasterCamera& camera, const SurfelGeometry& g, vfloat reach) {
+  ScreenBound s;
+  vfloat sx = camera.fx * g.inverse_z * g.inverse_z, sy = camera.fy * g.inverse_z * g.inverse_z;
+  vfloat a00 = sx * g.pa.y, a01 = sx * g.pb.y, a10 = -sy * g.pa.x, a11 = -sy * g.pb.x;
+  vfloat e0 = g.a.z * g.inverse_z, e1 = g.b.z * g.inverse_z;
+  vfloat margin = 1.f - reach * (e0 * e0 + e1 * e1);
+  vmask bounded = gt(margin, broadcast(1e-3f));
+  vfloat t = reach / select(bounded, margin, broadcast(1.f));
+  vfloat x = -t * (a00 * e0 + a01 * e1), y = -t * (a10 * e0 + a11 * e1);
+  vfloat xx = x * x + t * (a00 * a00 + a01 * a01), yy = y * y + t * (a10 * a10 + a11 * a11);
+  vfloat xy = x * y + t * (a00 * a10 + a01 * a11);
+  vfloat det = sx * camera.fy * (dot(g.n, g.p) * g.inverse_z);  // det A = fx fy n.p / z^3
+  vfloat area = t * t * det * det / select(bounded, margin, broadcast(1.f));
+  vfloat wide_x = xx * 1.0001f + 1e-4f, wide_y = yy * 1.0001f + 1e-4f;
+  s.centre_x = g.mean_x + x;
+  s.centre_y = g.mean_y + y;
+  s.slope_y = xy / wide_x;
+  s.slope_x = xy / wide_y;
+  s.inv_x2 = where(bounded, 1.f / wide_x);
+  s.inv_y2 = where(bounded, 1.f / wide_y);
+  s.inv_y2_given_x = where(bounded, 1.f / ((area / wide_x) * 1.0001f + (1e-4f + 1e-10f * yy)));
+  s.inv_x2_given_y = where(bounded, 1.f / ((area / wide_y) * 1.0001f + (1e-4f + 1e-10f * xx)));
+  s.disc2 = reach * 0.50005f + 1e-4f;
+  vfloat half_x = sqrt(wide_x), half_y = sqrt(wide_y), disc = sqrt(s.disc2);
+  const vfloat far_away = broadcast(1e9f);
+  s.left = select(bounded, g.mean_x + min(x - half_x, -disc), -far_away);
+  s.right = select(bounded, g.mean_x + max(x + half_x, disc), far_away);
+  s.top = select(bounded, g.mean_y + min(y - half_y, -disc), -far_away);
+  s.bottom = select(bounded, g.mean_y + max(y + half_y, disc), far_away);
+  return s;
+}
+
+// First and last pixel whose centre lies in [low, high], clipped to the image; first > last: none.
+struct PixelRange {
+  vfloat first, last;
+};
+PixelRange pixel_range(vfloat low, vfloat high, int size) {
+  const float limit = float(size);
+  return {max(-floor(clamp(0.5f - low, -limit - 1.f, 1.f)), broadcast(0.f)),
+          min(floor(clamp(high - 0.5f, -1.f, limit + 1.f)), broadcast(limit - 1.f))};
+}
+
+struct Projection {
+  vfloat fields[kChannels], depth_scale, depth, normal_sign;
+  vint x0, y0, x1, y1;  // tiles
+  uint32_t visible;     // bit per lane
+};
+
+Projection project_lanes(const RasterCamera& camera, const SurfelGeometry& g) {
+  Projection out;
+  vmask keep = g.finite_inputs & gt(g.p.z, broadcast(camera.near)) & ge(g.opacity, broadcast(kMinAlpha)) &
+               gt(g.scale_u, broadcast(0.f)) & gt(g.scale_v, broadcast(0.f));
+  vfloat log_opacity = log2(select(keep, g.opacity, broadcast(1.f)));
+  vfloat reach = max((log_opacity - kLog2MinAlpha) * (1.f / kHalfLog2E), broadcast(0.f));
+  ScreenBound bound = screen_bound(camera, g, reach);
+  out.depth = g.p.z;
+  out.depth_scale = g.p.z * g.c[6];
+  out.normal_sign = normal_sign(g);
+  vfloat min_inverse = select(gt(out.depth_scale, broadcast(1e-37f)),
+                              camera.near / max(out.depth_scale, broadcast(1e-37f)), broadcast(3e38f));
+  const vfloat fields[kChannels] = {
+      g.mean_x, g.mean_y, g.c[0], g.c[1], g.c[2], g.c[3], g.c[4], g.c[5], g.c[6], log_opacity, min_inverse,
+      bound.centre_x, bound.centre_y, bound.slope_y, bound.slope_x, bound.inv_x2, bound.inv_y2_given_x, bound.inv_y2,
+      bound.inv_x2_given_y, bound.disc2};
+  for (int k = 0; k < kChannels; ++k) {
+    out.fields[k] = fields[k];
+    keep = keep & finite(fields[k]);
+  }
+  PixelRange x = pixel_range(bound.left, bound.right, camera.width);
+  PixelRange y = pixel_range(bound.top, bound.bottom, camera.height);
+  keep = keep & ge(x.last, x.first) & ge(y.last, y.first);
+  out.x0 = truncate(x.first) / kTileSide;
+  out.x1 = truncate(x.last) / kTileSide;
+  out.y0 = truncate(y.first) / kTileSide;
+  out.y1 = truncate(y.last) / kTileSide;
+  out.visible = mask_bits(keep);
+  return out;
+}
+
+bool all_finite(const float* values, int count) {
+  vmask ok = first_lanes(kLanes);
+  for (int k = 0; k < count; k += kLanes) ok = ok & finite(load_first(values + k, count - k));
+  return !any(mask_not(ok));
+}
+
+void write_channels(const RecordLayout& layout, const SurfelGeometry& g, const Projection& p, int lane,
+                    const float* features, float* channels) {
+  const int count = layout.normal ? layout.channels - 3 : layout.channels;
+  for (int k = 0; k < count; ++k) channels[k] = features[k];
+  for (int k = layout.channels; k < layout.padded_channels; ++k) channels[k] = 0.f;
+  if (layout.normal) {
+    float* normal = channels + count;
+    const float ux = g.tangent_u.x[lane], uy = g.tangent_u.y[lane], uz = g.tangent_u.z[lane];
+    const float vx = g.tangent_v.x[lane], vy = g.tangent_v.y[lane], vz = g.tangent_v.z[lane];
+    const float sign = p.normal_sign[lane];
+    normal[0] = sign * (uy * vz - uz * vy);
+    normal[1] = sign * (uz * vx - ux * vz);
+    normal[2] = sign * (ux * vy - uy * vx);
+  }
+}
+
+}  // namespace
+
+void project_surfels(const RasterCamera& camera, const SurfelArrays& in, const ProjectedSurfels& out, int threads) {
+  const RecordLayout layout = out.layout;
+  const int64_t groups = (in.count + kLanes - 1) / kLanes;
+#pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1)
+  for (int64_t group = 0; group < groups; ++group) {
+    const int64_t first = group * kLanes;
+    const int lanes = int(in.count - first < kLanes ? in.count - first : kLanes);
+    SurfelGeometry g = surfel_geometry(camera, in, first);
+    Projection p = project_lanes(camera, g);
+    alignas(64) float fields[kChannels][kLanes];
+    for (int k = 0; k < kChannels; ++k) store(fields[k], p.fields[k]);
+    for (int lane = 0; lane < lanes; ++lane) {
+      const int64_t id = first + lane;
+      const float* features = in.features + id * in.channels;
+      if (!(p.visible >> lane & 1) || !all_finite(features, in.channels)) {
+        out.rects[id] = {0, 0, -1, -1};
+        continue;
+      }
+      out.rects[id] = {int16_t(p.x0[lane]), int16_t(p.y0[lane]), int16_t(p.x1[lane]), int16_t(p.y1[lane])};
+      out.depths[id] = p.depth[lane];
+      float* record = out.records + id * layout.record_stride;
+      for (int k = 0; k < kChannels; ++k) record[k] = fields[k][lane];
+      write_channels(layout, g, p, lane, features, record + kChannels);
+      float* depth = record + kChannels + layout.padded_channels;
+      if (layout.depth) {
+        depth[0] = p.depth_scale[lane];
+        depth[1] = p.depth[lane];
+      }
+    }
+  }
+}
+
+}  // namespace rtgs::RTGS_ISA

@@ -1,2 +1,0 @@
-namespace rtgs::RTGS_ISA {
-}  // namespace rtgs::RTGS_ISA

@@ -1,0 +1,196 @@
+"""The surfel rasteriser on the native core (docs/rasterizer.md says what it computes, kernels in rtgs/native/raster*)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from rtgs.cameras import Camera
+from rtgs.native import core
+from rtgs.render.buffers import RasterBuffers, RasterOptions
+
+MAX_CHANNELS = 32
+MAX_SIDE = 1 << 18  # tile numbers are 16-bit
+_DEFAULT_OPTIONS = RasterOptions()
+
+
+def rasterize_surfels(
+    means: Tensor,
+    tangent_u: Tensor,
+    tangent_v: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    camera: Camera,
+    *,
+    background: Tensor | None = None,
+    options: RasterOptions = _DEFAULT_OPTIONS,
+    screen_probe: Tensor | None = None,
+) -> RasterBuffers:
+    """Render N surfels; :func:`rtgs.render.reference.rasterize_surfels` is its float64 twin.
+
+    Runs on ``torch.get_num_threads()`` threads; the result does not depend on their number, bit for bit.
+
+    Args:
+        means: (N, 3) float32 centres, world frame. N = 0 is legal.
+        tangent_u, tangent_v: (N, 3) world; taken as given, not normalised.
+        scales: (N, 2) standard deviations along the tangents, world units.
+        opacities: (N,) in (0, 1].
+        features: (N, C), 1 <= C <= 32.
+        camera: pinhole camera; not differentiated.
+        background: (C,) composited behind everything; None is black. Not differentiated.
+        options: optional outputs, near and far plane.
+        screen_probe: (N, 2), any values: its gradient receives the densification signal (methods.md 3.1).
+
+    Raises:
+        ValueError: a shape, a dtype or an option does not fit; the message names the argument.
+    """
+    tensors = {
+        "means": means,
+        "tangent_u": tangent_u,
+        "tangent_v": tangent_v,
+        "scales": scales,
+        "opacities": opacities,
+        "features": features,
+        "background": background,
+        "screen_probe": screen_probe,
+    }
+    _check_shapes(tensors)
+    _check_options(options, camera)
+    if background is not None:
+        background = background.detach().contiguous()
+    call = _Call(camera, options, background, torch.get_num_threads())
+    outputs = _Rasterize.apply(
+        means.contiguous(),
+        tangent_u.contiguous(),
+        tangent_v.contiguous(),
+        scales.contiguous(),
+        opacities.contiguous(),
+        features.contiguous(),
+        screen_probe,
+        call,
+    )
+    return RasterBuffers(*outputs)
+
+
+@dataclass(frozen=True)
+class _Call:
+    camera: Camera
+    options: RasterOptions
+    background: Tensor | None
+    threads: int
+
+    def native_camera(self) -> core.RasterCamera:
+        c, o = self.camera, self.options
+        rotation, translation = c.rotation.contiguous().numpy(), c.translation.contiguous().numpy()
+        return core.RasterCamera(rotation, translation, c.fx, c.fy, c.cx, c.cy, c.width, c.height, o.near, o.far)
+
+
+def _array(tensor: Tensor | None):
+    return None if tensor is None else tensor.detach().numpy()
+
+
+def _empty(wanted: bool, *shape: int) -> Tensor | None:
+    return torch.empty(shape) if wanted else None
+
+
+class _Rasterize(torch.autograd.Function):
+    """Memory of the forward pass lives in ``ctx.native`` and returns to a pool when autograd drops the context."""
+
+    @staticmethod
+    def forward(ctx, means, tangent_u, tangent_v, scales, opacities, features, screen_probe, call: _Call):
+        options, width, height = call.options, call.camera.width, call.camera.height
+        arrays = [_array(t) for t in (means, tangent_u, tangent_v, scales, opacities, features)]
+        needs_depth = options.depth or options.median_depth or options.distortion
+        native = core.Rasterization(call.native_camera(), options.normal, needs_depth)
+        native.project(*arrays, call.threads)
+
+        image = torch.empty(features.shape[1], height, width)
+        alpha = torch.empty(height, width)
+        depth = _empty(options.depth, height, width)
+        median_depth = _empty(options.median_depth, height, width)
+        normal = _empty(options.normal, 3, height, width)
+        distortion = _empty(options.distortion, height, width)
+        weight_sum = _empty(options.weight_sum, means.shape[0])
+        native.forward(
+            _array(call.background),
+            _array(image),
+            _array(normal),
+            _array(alpha),
+            _array(depth),
+            _array(median_depth),
+            _array(distortion),
+            _array(weight_sum),
+            call.threads,
+        )
+        if any(ctx.needs_input_grad):
+            ctx.native, ctx.threads = native, call.threads
+            ctx.save_for_backward(
+                means, tangent_u, tangent_v, scales, opacities, features, image, normal, depth, distortion
+            )
+            if weight_sum is not None:
+                ctx.mark_non_differentiable(weight_sum)
+            ctx.set_materialize_grads(False)
+        return image, alpha, depth, median_depth, normal, distortion, weight_sum
+
+    @staticmethod
+    def backward(ctx, g_image, g_alpha, g_depth, g_median, g_normal, g_distortion, _g_weight_sum):  # type: ignore[override]
+        *inputs, image, normal, depth, distortion = ctx.saved_tensors
+        upstream = [g_image, g_normal, g_alpha, g_depth, g_median, g_distortion]
+        if all(g is None for g in upstream):
+            return (None,) * 8
+        means = inputs[0]
+        like = [*inputs, means[:, :2]]
+        gradients = [
+            torch.empty(t.shape) if needed else None for t, needed in zip(like, ctx.needs_input_grad, strict=False)
+        ]
+        ctx.native.backward(
+            *(_array(t) for t in inputs),
+            _array(image),
+            _array(normal),
+            _array(depth),
+            _array(distortion),
+            *(None if g is None else _array(g.contiguous()) for g in upstream),
+            *(_array(g) for g in gradients),
+            ctx.threads,
+        )
+        return (*gradients, None)
+
+
+def _check_shapes(tensors: dict[str, Tensor | None]) -> None:
+    features, means = tensors["features"], tensors["means"]
+    channels = features.shape[1] if features.ndim == 2 else 0
+    if not 1 <= channels <= MAX_CHANNELS:
+        raise ValueError(f"features must be (N, C) with 1 <= C <= {MAX_CHANNELS}, got {tuple(features.shape)}")
+    count = means.shape[0] if means.ndim else 0
+    expected = {
+        "means": (count, 3),
+        "tangent_u": (count, 3),
+        "tangent_v": (count, 3),
+        "scales": (count, 2),
+        "opacities": (count,),
+        "features": (count, channels),
+        "background": (channels,),
+        "screen_probe": (count, 2),
+    }
+    for name, tensor in tensors.items():
+        if tensor is None:
+            continue
+        if tuple(tensor.shape) != expected[name]:
+            raise ValueError(
+                f"{name} must have shape {expected[name]} to fit means and features, got {tuple(tensor.shape)}"
+            )
+        if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
+            raise ValueError(
+                f"{name} must be float32 on the CPU, got {tensor.dtype} on {tensor.device}; "
+                "convert it, or use rtgs.render.reference for float64"
+            )
+
+
+def _check_options(options: RasterOptions, camera: Camera) -> None:
+    if not 0 < options.near < options.far:
+        raise ValueError(f"near={options.near} and far={options.far} must satisfy 0 < near < far (world units)")
+    if max(camera.width, camera.height) > MAX_SIDE:
+        raise ValueError(f"image of {camera.width}x{camera.height}: sides above {MAX_SIDE} pixels are not supported")
