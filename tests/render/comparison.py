@@ -59,6 +59,10 @@ class ErrorPool:
         judged = self._judged()
         return (judged > tolerance).double().mean().item()
 
+    def beyond_share(self, share: float) -> float:
+        """The error that all but this share of the judged elements stay within; an interpolated quantile."""
+        return torch.quantile(self._judged(), 1 - share).item()
+
     @property
     def worst(self) -> float:
         """Largest judged error."""

@@ -96,7 +96,7 @@ def recipes(kind: str) -> st.SearchStrategy[Recipe]:
         Recipe,
         kind=st.just(kind),
         seed=st.integers(0, 2**31),
-        count=st.integers(1, 40),
+        count=st.integers(1, 40) if kind == "ordinary" else st.integers(10, 40),
         width=st.integers(1, 35),
         height=st.integers(1, 33),
         channels=st.integers(1, 32),

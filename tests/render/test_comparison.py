@@ -43,6 +43,8 @@ def test_pool_counts_shares_over_all_examples():
     assert pool.share_beyond(1e-4) == pytest.approx(0.1)
     assert pool.share_beyond(1e-2) == 0
     assert pool.worst == pytest.approx(1e-3)
+    assert pool.beyond_share(0.2) == 0
+    assert pool.beyond_share(0.0) == pytest.approx(1e-3)
 
 
 def test_pool_leaves_flagged_elements_out_but_counts_them():

@@ -86,16 +86,15 @@ def test_tie_with_an_unseen_surfel_is_no_tie():
     shape = {"scales": (0.05, 0.05), "opacity": 0.3}
     camera = turned_camera()
     ray = camera.rotation.T @ torch.tensor([0.06, 0.0, 3.0], dtype=torch.float64)
-    aside = camera.rotation.T @ torch.tensor([1.3, 0.0, 3.0], dtype=torch.float64)
-    pair = [surfel(tuple(p.tolist()), **shape) for p in (ray, aside)]
-    assert not flagged(join(*pair), camera, options=PLAIN)
+    aside = [camera.rotation.T @ torch.tensor([1.3, 0.0, z], dtype=torch.float64) for z in (3 - 5e-7, 3 + 5e-7)]
+    assert not flagged(join(*(surfel(tuple(p.tolist()), **shape) for p in (ray, *aside))), camera, options=PLAIN)
 
 
 def test_centre_and_hit_at_the_near_plane():
-    wide = {"scales": (5.0, 5.0), "opacity": 0.5}
-    assert flagged(surfel((1e-3, 0, 0.2 + 1e-8), **wide), options=PLAIN)
-    assert flagged(surfel((1e-3, 0, 0.2 - 1e-8), **wide), options=PLAIN)
-    assert not flagged(surfel((1e-3, 0, 0.2001), **wide), options=RasterOptions(near=0.2))
+    wide = {"tangent_u": (1.0, 0.0, -1.0), "scales": (5.0, 5.0), "opacity": 0.5}  # the middle pixel's hit is at 0.26
+    assert flagged(surfel((0.06, 0, 0.2 + 1e-8), **wide), options=PLAIN)
+    assert flagged(surfel((0.06, 0, 0.2 - 1e-8), **wide), options=PLAIN)
+    assert not flagged(surfel((0.06, 0, 0.2001), **wide), options=PLAIN)
     for z_hit, expected in (
         (0.2 * (1 + 5e-5), True),
         (0.2 * (1 - 5e-5), True),

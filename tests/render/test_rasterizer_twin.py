@@ -1,8 +1,9 @@
 """The native rasteriser against its twin: hypothesis-drawn scenes, errors pooled over all examples of a test.
 
 Ordinary scenes: pictures within 1e-5 of their maximum on all but 1e-3 of the pixels, gradients within 1e-4 of their
-largest element. Degenerate scenes: the larger of these and four times the error of the twin itself run in float32.
-Pixels on a discontinuity are flagged, counted, and given no upstream gradient.
+largest element. Degenerate scenes: the larger of these and four times the error of the twin itself run in float32, for
+gradients on all but 1e-2 of the elements; the maximum hangs on the one gradient that nearly vanishes, and is given more
+room. Pixels on a discontinuity are flagged, counted, and given no upstream gradient.
 """
 
 import pytest
@@ -17,6 +18,8 @@ from .twin_runs import Pools, expected, rounded, run
 PIXEL_TOLERANCE, PIXEL_SHARE = 1e-5, 1e-3
 GRADIENT_TOLERANCE = 1e-4
 SLACK = 4.0  # of degenerate scenes, over the twin in float32
+GRADIENT_SHARE = 1e-2  # of degenerate scenes: elements that may go beyond
+GROSS_TOLERANCE, GROSS_SLACK = 1e-3, 16.0  # for those
 
 
 def pool_examples(kind: str, examples: int, *, with_twin: bool = False) -> tuple[Pools, Pools]:
@@ -54,7 +57,9 @@ def test_degenerate_scenes(isa: str, kind: str):
         allowed = max(PIXEL_SHARE, SLACK * twin.pictures[name].share_beyond(PIXEL_TOLERANCE))
         assert pool.share_beyond(PIXEL_TOLERANCE) <= allowed, f"{name}: worst {pool.worst:.1e}"
     for name, pool in pools.gradients.items():
-        assert pool.worst <= max(GRADIENT_TOLERANCE, SLACK * twin.gradients[name].worst), name
+        allowed = max(GRADIENT_TOLERANCE, SLACK * twin.gradients[name].beyond_share(GRADIENT_SHARE))
+        assert pool.beyond_share(GRADIENT_SHARE) <= allowed, name
+        assert pool.worst <= max(GROSS_TOLERANCE, GROSS_SLACK * twin.gradients[name].worst), name
 
 
 def test_crowded_picture(isa: str):
