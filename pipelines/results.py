@@ -11,6 +11,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from filelock import FileLock
+
 from pipelines.evaluate import TABLE_CSV, TABLE_JSON
 from pipelines.report import PAGE
 from pipelines.training import read_history, stage_params
@@ -53,6 +55,19 @@ def write_run_folder(config: RunConfig, choices: Choices, command: str, results:
     """
     folder = config.paths.runs / str(config.name)
     steps = {result.step.name: result.step.fingerprint for result in results}
+    config.paths.runs.mkdir(parents=True, exist_ok=True)
+    with FileLock(str(config.paths.runs / f".{config.name}.lock")):
+        return _fill_run_folder(folder, config, choices, command, results, steps)
+
+
+def _fill_run_folder(
+    folder: Path,
+    config: RunConfig,
+    choices: Choices,
+    command: str,
+    results: Sequence[StepResult],
+    steps: dict[str, str],
+) -> Path:
     known = RunRecord.read(folder)
     if known is not None and known.steps == steps and (folder / PAGE).is_file():
         return folder
@@ -113,7 +128,7 @@ def result_table(tables: Sequence[EvaluationTable]) -> str:
     from rtgs.evaluate.tables import summarize
 
     header = ("scene", "method", "preset", "views", "PSNR", "SSIM", "LPIPS", "train", "memory", "surfels")
-    rows = [header]
+    rows: list[tuple[str, ...]] = [header]
     for row in summarize(tables):
         rows.append(
             (

@@ -80,7 +80,8 @@ def train_stage(params: StageParams, context: StepContext) -> None:
     record = {key: _finite(value) for key, value in asdict(summary).items()}
     (context.out / SUMMARY_FILE).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
     recorder.write_history(context.out / HISTORY_FILE)
-    context.tracker.metrics({f"final/{key}": value for key, value in record.items() if type(value) in (int, float)})
+    numbers = {f"final/{key}": value for key, value in record.items() if isinstance(value, (int, float))}
+    context.tracker.metrics(numbers)
 
 
 def _start_from_stage_before(context: StepContext, checkpoints: Path) -> None:

@@ -5,8 +5,11 @@ from __future__ import annotations
 import json
 import logging
 import math
+import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -229,10 +232,43 @@ def test_help_and_unknown_commands(capsys):
     assert "unknown command 'fly'" in capsys.readouterr().err
 
 
-def test_the_module_is_the_same_as_the_command(first, words, root):
+def test_help_of_run_lists_groups_and_keys(capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["run", "--help"])
+    assert ended.value.code in (0, None)
+    shown = capsys.readouterr().out
+    for text in ("method: 2dgs", "rtgs run scene.path=", "preset: ", "densify_until"):
+        assert text in shown
+
+
+def test_the_module_is_the_same_as_the_command(first, words):
     code = [sys.executable, "-m", "pipelines.run", *words[1:]]
     result = subprocess.run(code, capture_output=True, text=True, check=True)
     assert "nothing to do" in result.stderr
-    result = subprocess.run([*code[:3], "--help"], capture_output=True, text=True, check=True)
-    for text in ("method: 2dgs", "rtgs run scene.path=", "preset: "):
-        assert text in result.stdout
+
+
+def test_a_killed_training_goes_on_and_ends_the_same(words, first, root, tmp_path, monkeypatch, capsys):
+    longer = [*words, "schedule.total=200", "schedule.checkpoint_every=20", "name=long"]
+    assert main(longer) == 0
+    monkeypatch.setenv("RTGS_ROOT", str(tmp_path))
+    process = subprocess.Popen([sys.executable, "-m", "rtgs", *longer], start_new_session=True)
+    end = time.monotonic() + 120
+    while not list(tmp_path.glob("store/train_diffuse/partial/*/checkpoints/step_*")):
+        assert process.poll() is None
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait(10)
+    assert not list(Store(tmp_path / "store").artifacts("train_diffuse"))
+
+    capsys.readouterr()
+    assert main(longer) == 0
+    assert "resumed from the checkpoint of step" in capsys.readouterr().err
+    (one,), (two,) = (
+        [a for a in Store(folder / "store").artifacts("train_diffuse") if a.manifest.params["schedule"]["total"] == 200]
+        for folder in (root, tmp_path)
+    )
+    assert one.manifest.fingerprint == two.manifest.fingerprint
+    assert one.manifest.files["base.ply"] == two.manifest.files["base.ply"]
+    assert not list((tmp_path / "store").rglob("*.tmp-*"))
+    assert not list((tmp_path / "store").glob("*/partial/*"))
