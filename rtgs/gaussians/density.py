@@ -127,16 +127,18 @@ class DensityControl:
                 f"{count} surfels observed, but the statistics are of {len(self.visible_steps)}; "
                 "change N through rtgs.gaussians.density.apply_plan"
             )
-        norm = signal.detach().norm(dim=1)
+        norm = torch.hypot(*signal.detach().unbind(1))
         weight = weight_sum.detach()
-        if not torch.isfinite(norm + weight).all():
-            bad = (~torch.isfinite(norm + weight)).nonzero().flatten()
-            raise FloatingPointError(
-                f"densification signal or weight sum of {len(bad)} surfels is NaN or inf (first ids {bad[:8].tolist()})"
-            )
+        either = norm + weight  # both are >= 0
+        if not math.isfinite(float(either.sum())):
+            bad = (~torch.isfinite(either)).nonzero().flatten().tolist()
+            if bad:
+                raise FloatingPointError(
+                    f"densification signal or weight sum of {len(bad)} surfels is NaN or inf (first ids {bad[:8]})"
+                )
         self.signal_sum += norm
         self.weight_sum += weight
-        self.visible_steps += (weight > 0) | (norm > 0)
+        self.visible_steps += either > 0
 
     @property
     def mean_signal(self) -> Tensor:

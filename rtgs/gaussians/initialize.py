@@ -9,6 +9,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from rtgs.errors import RtgsError
 from rtgs.gaussians.harmonics import rest_count, rgb_to_sh_dc
 from rtgs.gaussians.surfels import Surfels
 from rtgs.train.settings import InitSettings
@@ -40,7 +41,8 @@ def surfels_from_points(
         Surfels that require gradients, float32.
 
     Raises:
-        ValueError: shapes do not match, or there are fewer usable points than ``settings.min_points``.
+        RtgsError: there are fewer usable points than ``settings.min_points``.
+        ValueError: shapes do not match.
     """
     if points.ndim != 2 or points.shape[1] != 3 or colors.shape != points.shape:
         raise ValueError(f"points and colors must both be (P, 3), got {tuple(points.shape)} and {tuple(colors.shape)}")
@@ -53,7 +55,7 @@ def surfels_from_points(
             box = points_box(points)
         points, colors = random_points(settings.random_points, box, generator)
     elif len(points) < settings.min_points:
-        raise ValueError(
+        raise RtgsError(
             f"only {len(points)} of {len(usable)} points are usable, but init.min_points is {settings.min_points}: "
             "check the reconstruction (are the images registered?), or ask for random points: init.random_points=20000"
         )
@@ -90,13 +92,13 @@ def points_box(points: Tensor) -> Tensor:
     """(2, 3) corners of the per-axis 0.5 to 99.5 percentile range of (P, 3) points, world.
 
     Raises:
-        ValueError: no point, or all at one place.
+        RtgsError: no point, or all at one place.
     """
     if not len(points):
-        raise ValueError("there are no points to take the scene box from; give the box of the random points")
+        raise RtgsError("there are no points to take the scene box from; give the box of the random points")
     box = torch.from_numpy(np.quantile(points.double().numpy(), BOX_QUANTILES, axis=0)).float()
     if not (box[1] > box[0]).any():
-        raise ValueError(f"all {len(points)} points are at {points[0].tolist()}; give the box of the random points")
+        raise RtgsError(f"all {len(points)} points are at {points[0].tolist()}; give the box of the random points")
     return box
 
 

@@ -16,6 +16,7 @@ import plyfile
 import torch
 from torch import Tensor
 
+from rtgs.errors import RtgsError
 from rtgs.gaussians.surfels import Surfels, tangents
 
 THIRD_LOG_SCALE = math.log(1e-6)  # what viewers get as the thickness of a surfel
@@ -73,27 +74,27 @@ def read_ply(path: str | Path) -> Surfels:
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: not a PLY, truncated, a property is missing, NaN or inf, or the Gaussians are not flat.
+        RtgsError: not a PLY, truncated, a property is missing, NaN or inf, or the Gaussians are not flat.
     """
     path = Path(path)
     vertices = _read_vertices(path)
     names = [p.name for p in vertices.properties if not isinstance(p, plyfile.PlyListProperty)]
     rest_count = sum(name.startswith("f_rest_") for name in names)
     if rest_count not in (0, 9, 24, 45):
-        raise ValueError(f"{path}: {rest_count} properties f_rest_*; SH of degree 0, 1, 2, 3 has 0, 9, 24, 45")
+        raise RtgsError(f"{path}: {rest_count} properties f_rest_*; SH of degree 0, 1, 2, 3 has 0, 9, 24, 45")
 
     def columns(*wanted: str) -> Tensor:
         if missing := [name for name in wanted if name not in names]:
-            raise ValueError(f"{path}: property {', '.join(missing)} missing; it has {', '.join(names) or 'none'}")
+            raise RtgsError(f"{path}: property {', '.join(missing)} missing; it has {', '.join(names) or 'none'}")
         out = np.empty((vertices.count, len(wanted)), np.float32)
         for k, name in enumerate(wanted):
             out[:, k] = vertices[name]
         if bad := np.flatnonzero(~np.isfinite(out).all(axis=1)).tolist():
-            raise ValueError(f"{path}: NaN or inf in {', '.join(wanted)} of {len(bad)} vertices, the first {bad[0]}")
+            raise RtgsError(f"{path}: NaN or inf in {', '.join(wanted)} of {len(bad)} vertices, the first {bad[0]}")
         return torch.from_numpy(out)
 
     if "scale_2" in names and len(thick := (columns("scale_2") > THICKEST_LOG_SCALE).nonzero()):
-        raise ValueError(
+        raise RtgsError(
             f"{path}: {len(thick)} of {vertices.count} Gaussians have a third scale (log > {THICKEST_LOG_SCALE:g}), "
             "so they are 3D Gaussians, not surfels; convert them first"
         )
@@ -122,13 +123,13 @@ def _read_vertices(path: Path) -> plyfile.PlyElement:
     try:
         ply = plyfile.PlyData.read(str(path))
     except (plyfile.PlyHeaderParseError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is not a PLY file: {error}") from error
+        raise RtgsError(f"{path} is not a PLY file: {error}") from error
     except (plyfile.PlyParseError, ValueError, MemoryError, OverflowError) as error:
-        raise ValueError(f"{path} is damaged or truncated: {error}") from error
+        raise RtgsError(f"{path} is damaged or truncated: {error}") from error
     if "vertex" not in ply:
-        raise ValueError(f"{path}: no element 'vertex'; it has {', '.join(e.name for e in ply.elements) or 'none'}")
+        raise RtgsError(f"{path}: no element 'vertex'; it has {', '.join(e.name for e in ply.elements) or 'none'}")
     if (unread := _unread_bytes(path, ply)) > 0:
-        raise ValueError(
+        raise RtgsError(
             f"{path} is damaged: {unread} bytes after the {ply['vertex'].count} vertices its header announces"
         )
     return ply["vertex"]

@@ -74,16 +74,33 @@ def test_any_count(isa, count):
         assert surfels.quaternions.grad.shape == (0, 4)
 
 
-@settings(max_examples=40, deadline=None)
+def spoil(surfels: Surfels, row: int, what: str) -> None:
+    """Make one surfel degenerate."""
+    if what == "quaternion":
+        surfels.quaternions[row] = 0
+    elif what == "centre":
+        surfels.means[row] = CENTER
+    elif what == "near":
+        surfels.means[row] = CENTER + 1e-3 * surfels.means[row]
+    elif what == "logit":
+        surfels.opacity_logits[row] = -80.0 if row % 2 else 80.0
+    elif what == "scale":
+        surfels.log_scales[row] = torch.tensor([39.0, -60.0])
+    elif what == "black":
+        surfels.sh_dc[row] = -5.0
+
+
+@settings(max_examples=60, deadline=None)
 @given(
     seed=st.integers(0, 2**31),
     count=st.integers(1, 40),
     degree=st.integers(0, 3),
     length=st.floats(-4, 4),
     spread=st.floats(0.1, 8),
+    degenerate=st.lists(st.sampled_from(["quaternion", "centre", "near", "logit", "scale", "black"]), max_size=4),
     isa=st.sampled_from(core.available_isas()),
 )
-def test_matches_twin_drawn(seed, count, degree, length, spread, isa):
+def test_matches_twin_drawn(seed, count, degree, length, spread, degenerate, isa):
     before = core.isa()
     core.select_isa(isa)
     try:
@@ -92,6 +109,8 @@ def test_matches_twin_drawn(seed, count, degree, length, spread, isa):
             surfels.quaternions *= 10**length
             surfels.log_scales *= spread
             surfels.opacity_logits *= spread
+            for row, what in enumerate(degenerate[:count]):
+                spoil(surfels, row, what)
         # The length of a short quaternion, or of a mean near the camera, multiplies its own gradient only.
         compare(surfels, degree, tolerance=3e-5)
     finally:
