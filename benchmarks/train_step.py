@@ -79,7 +79,9 @@ class StepBench:
         inputs = [activated.means, *_shaded(activated)]
         shaded_upstream = [torch.randn(t.shape) for t in inputs[1:]]
         leaves = [tensor.detach().clone().requires_grad_() for tensor in inputs]
+        means, tangent_u, tangent_v, scales, opacities, colors = leaves
         options = self.method.raster_options(self.method.training_options(STEP), weight_sum=True)
+        background = torch.zeros(3)
         weights = self.method.settings.loss
         image = buffers.features.detach().requires_grad_()
         normal, depth, alpha = (
@@ -97,8 +99,17 @@ class StepBench:
         def raster() -> None:
             probe = base.new_probe()
             found = rasterize_surfels(
-                *leaves, self.camera, background=torch.zeros(3), options=options, screen_probe=probe
-            )  # type: ignore[misc]
+                means,
+                tangent_u,
+                tangent_v,
+                scales,
+                opacities,
+                colors,
+                self.camera,
+                background=background,
+                options=options,
+                screen_probe=probe,
+            )
             pairs = [(o, g) for o, g in zip(_with_gradient(found), upstream, strict=True) if g is not None]
             torch.autograd.backward([o for o, _ in pairs], [g for _, g in pairs])
             for leaf in leaves:
