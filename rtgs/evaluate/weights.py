@@ -104,11 +104,14 @@ def find_weights(file: PretrainedFile, folders: Iterable[Path] | None = None) ->
 
 
 def _readable(folder: Path) -> str:
-    """A folder as a person would name it, without this machine's home in it."""
-    root, home = Path(__file__).resolve().parents[2], Path.home()
+    """A folder as a person would name it: the same words on every machine."""
+    root = Path(__file__).resolve().parents[2]
     if folder.is_relative_to(root):
         return f"{folder.relative_to(root)}/ beside the package"
-    return f"~/{folder.relative_to(home)}" if folder.is_relative_to(home) else str(folder)
+    for variable in ("RTGS_WEIGHTS", "RTGS_SHARED"):
+        if (place := os.environ.get(variable)) and folder.is_relative_to(Path(place).expanduser()):
+            return str(Path(f"${variable}") / folder.relative_to(Path(place).expanduser()))
+    return f"~/{folder.relative_to(Path.home())}" if folder.is_relative_to(Path.home()) else str(folder)
 
 
 def verify_weights(file: PretrainedFile, path: Path) -> None:

@@ -244,6 +244,7 @@ def _charts(curves: Sequence[Curve]) -> list[str]:
     psnr = [curve for curve in curves if curve.name.endswith("/psnr")]
     counts = [curve for curve in curves if curve.name.startswith("surfels/")]
     losses = [curve for curve in curves if curve not in psnr and curve not in counts]
+    losses.sort(key=lambda curve: curve.name != "train/loss")  # the total first
     return [
         curve_svg([_renamed(curve, "train/") for curve in losses], label="Loss terms", log=True),
         curve_svg([_renamed(curve, "", "/psnr") for curve in psnr], label="PSNR, dB"),

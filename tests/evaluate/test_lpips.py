@@ -179,7 +179,10 @@ def test_missing_weights_say_where_to_get_them(tmp_path: Path, monkeypatch: pyte
 
 def test_search_order_and_verification(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("RTGS_WEIGHTS", str(tmp_path))
+    monkeypatch.setenv("RTGS_SHARED", str(tmp_path / "shared"))
     assert pretrained.weight_folders()[0] == tmp_path
+    with pytest.raises(MissingWeights, match=r"searched \$RTGS_WEIGHTS, .*\$RTGS_(WEIGHTS/shared|SHARED)/data/weights"):
+        pretrained.find_weights(pretrained.VGG16, pretrained.weight_folders())
     (tmp_path / pretrained.VGG16.filename).write_bytes(b"another file")
     assert pretrained.find_weights(pretrained.VGG16) == tmp_path / pretrained.VGG16.filename
     with pytest.raises(WrongWeights, match="SHA-256"):
