@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from rtgs.errors import RtgsError
@@ -83,7 +83,7 @@ def neighbor_distance(points: Tensor, neighbors: int) -> Tensor:
     if count < 1:
         return torch.full((len(points),), math.sqrt(SMALLEST_SQUARED_DISTANCE))
     coordinates = points.double().numpy()
-    distance, _ = cKDTree(coordinates).query(coordinates, k=count + 1, workers=torch.get_num_threads())
+    distance, _ = KDTree(coordinates).query(coordinates, k=count + 1, workers=torch.get_num_threads())
     squared = np.square(distance[:, 1:]).mean(axis=1)  # column 0 is the point itself (or its duplicate, also at 0)
     return torch.from_numpy(np.sqrt(np.maximum(squared, SMALLEST_SQUARED_DISTANCE))).float()
 
