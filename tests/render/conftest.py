@@ -1,14 +1,10 @@
 """Fixtures of the rasteriser tests."""
 
-import importlib.util
 from collections.abc import Iterator
 
 import pytest
 
 from rtgs.native import core
-
-if importlib.util.find_spec("rtgs.render.rasterize") is None:
-    collect_ignore = ["test_rasterizer_twin.py", "test_rasterizer_rules.py"]
 
 
 @pytest.fixture(params=["avx512", "avx2", "portable"])
