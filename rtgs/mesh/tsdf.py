@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,7 +20,6 @@ from rtgs.errors import RtgsError
 from rtgs.mesh.triangles import TriangleMesh
 
 BLOCK = 8  # voxels along the side of a block
-FIRST_BLOCKS = 4096  # room reserved at the start; it grows
 
 
 @dataclass(frozen=True)
@@ -30,12 +30,13 @@ class TsdfSettings:
     depth_trunc_radii: float = 2.0  # 2DGS bounded mode
     voxel: float = 0.0  # 0: depth_trunc / resolution
     resolution: int = 1024  # 2DGS
+    finest_pixels: float = 1.0  # a derived voxel is no finer than this many pixels seen from the radius; 0: as 2DGS
     truncation_voxels: float = 5.0  # 2DGS
     min_alpha: float = 0.5  # depths of pixels with less alpha are ignored (2DGS, its mask rule)
     min_weight: float = 1.0  # observations a voxel needs to carry surface; 2DGS takes any
     keep_clusters: int = 50  # largest connected pieces that stay (2DGS); 0: all
     min_triangles: int = 50  # pieces with fewer go in any case (2DGS)
-    max_blocks: int = 400_000  # of 8^3 voxels, about 4 GB; beyond it the fusion stops with an error
+    max_blocks: int = 400_000  # of 8^3 voxels, 8 GB at the end; beyond it the fusion stops with an error
 
 
 @dataclass(frozen=True)
@@ -88,22 +89,21 @@ def focus_region(cameras: Sequence[Camera]) -> FocusRegion:
 def fuse_depths(
     views: Iterable[DepthView], cameras: Sequence[Camera], settings: TsdfSettings = TsdfSettings()
 ) -> MeshResult:
-    """Fuse the views and extract the mesh; views are taken one by one, so an iterator need not hold them all.
+    """Fuse the views and extract the mesh; views are taken one by one, and only depth and 8-bit image of each are kept.
 
     ``cameras``: those of the views, from which lengths are derived where the settings say 0. The mesh has colours when
-    the first view has an image; then every view must.
+    the views have images; either all or none must.
 
     Raises:
         RtgsError: no cameras, no usable depth, more blocks than ``max_blocks``, no surface left, or Open3D's system
             library is missing.
     """
     depth_trunc, voxel = fusion_lengths(cameras, settings)
-    fusion: _Fusion | None = None
+    import_open3d()  # before the work, not after it
+    fusion = _Fusion(settings, voxel, depth_trunc)
     for view in views:
-        if fusion is None:
-            fusion = _Fusion(settings, voxel, depth_trunc, with_color=view.image is not None)
         fusion.add(view)
-    if fusion is None or fusion.observed == 0:
+    if not fusion.observations:
         raise RtgsError(
             f"none of the {len(cameras)} views has a depth in (0, {depth_trunc:g}] with alpha >= "
             f"{settings.min_alpha:g} (inside the masks, where given): nothing to fuse"
@@ -111,60 +111,53 @@ def fuse_depths(
     return fusion.extract()
 
 
-class _Fusion:
-    """The voxel grid while views are added."""
+@dataclass(frozen=True)
+class _Observation:
+    """One view, ready to be integrated."""
 
-    def __init__(self, settings: TsdfSettings, voxel: float, depth_trunc: float, with_color: bool) -> None:
-        self.settings, self.voxel, self.depth_trunc, self.with_color = settings, voxel, depth_trunc, with_color
-        self.observed = 0  # pixels fused
-        self._open3d = import_open3d()
-        number = self._open3d.core.float32
-        shapes = {"tsdf": (1), "weight": (1)} | ({"color": (3)} if with_color else {})
-        self._grid = self._open3d.t.geometry.VoxelBlockGrid(
-            tuple(shapes), (number,) * len(shapes), tuple(shapes.values()), voxel, BLOCK, FIRST_BLOCKS
-        )
+    camera: Camera
+    depth: np.ndarray  # (H, W) float32, 0: nothing
+    pixels: np.ndarray | None  # (H, W, 3) uint8
+    blocks: np.ndarray  # (B,) packed block indices
+
+
+class _Fusion:
+    """Collects the views, then integrates them into a grid of exactly the size they need.
+
+    (A grid that grows copies itself each time; growing took three times the memory of the final grid.)
+    """
+
+    def __init__(self, settings: TsdfSettings, voxel: float, depth_trunc: float) -> None:
+        self.settings, self.voxel, self.depth_trunc = settings, voxel, depth_trunc
+        self.observations: list[_Observation] = []
+        self._blocks = np.empty(0, np.int64)
 
     def add(self, view: DepthView) -> None:
-        """Integrate one view. Open3D truncates pixel coordinates: pixel edges at integers, as in our cameras."""
-        camera, settings = view.camera, self.settings
-        depth = usable_depth(view, self.depth_trunc, settings.min_alpha)
-        blocks = blocks_near_surface(camera, depth, self.voxel, settings.truncation_voxels)
+        """Note what the view sees; nothing when it has no usable depth."""
+        depth = usable_depth(view, self.depth_trunc, self.settings.min_alpha)
+        blocks = blocks_near_surface(view.camera, depth, self.voxel, self.settings.truncation_voxels)
         if len(blocks) == 0:
             return
-        geometry, tensor = self._open3d.t.geometry, self._open3d.core.Tensor
-        images = [geometry.Image(depth)]
-        if self.with_color:
-            if view.image is None:
-                raise ValueError(f"view {camera.name!r} has no image although the first view has one")
-            images.append(geometry.Image(view.image.detach().float().clamp(0, 1).permute(1, 2, 0).contiguous().numpy()))
-        intrinsic = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
-        extrinsic = np.eye(4)
-        extrinsic[:3, :3], extrinsic[:3, 3] = camera.rotation.numpy(), camera.translation.numpy()
-        scale = 1.0
-        self._grid.integrate(
-            tensor(blocks),
-            *images,
-            tensor(intrinsic),
-            tensor(extrinsic),
-            scale,
-            self.depth_trunc,
-            settings.truncation_voxels,
-        )
-        self.observed += int((depth > 0).sum())
-        allocated = int(self._grid.hashmap().size())
-        if allocated > settings.max_blocks:
+        if self.observations and (view.image is None) != (self.observations[0].pixels is None):
+            raise ValueError(f"view {view.camera.name!r}: either every view has an image or none")
+        pixels = None if view.image is None else _to_bytes(view.image)
+        self.observations.append(_Observation(view.camera, depth, pixels, blocks))
+        self._blocks = np.union1d(self._blocks, blocks)
+        if len(self._blocks) > self.settings.max_blocks:
             raise RtgsError(
-                f"the mesh grid reached {allocated} blocks of {BLOCK}^3 voxels, max_blocks is {settings.max_blocks}: "
-                f"raise the voxel (now {self.voxel:g}) or lower depth_trunc (now {self.depth_trunc:g})"
+                f"the mesh grid reached {len(self._blocks)} blocks of {BLOCK}^3 voxels, max_blocks is "
+                f"{self.settings.max_blocks}: raise the voxel (now {self.voxel:g}) or lower depth_trunc "
+                f"(now {self.depth_trunc:g})"
             )
 
     def extract(self) -> MeshResult:
-        """Marching cubes, then the largest pieces."""
+        """Integrate, marching cubes, then the largest pieces."""
         settings = self.settings
-        found = self._grid.extract_triangle_mesh(weight_threshold=settings.min_weight)
+        with_color = self.observations[0].pixels is not None
+        found = self._integrated(with_color).extract_triangle_mesh(weight_threshold=settings.min_weight)
         vertices = found.vertex.positions.numpy() if "positions" in found.vertex else np.empty((0, 3), np.float32)
         faces = found.triangle.indices.numpy() if "indices" in found.triangle else np.empty((0, 3), np.int32)
-        colors = np.clip(found.vertex.colors.numpy(), 0, 1) if self.with_color and len(vertices) else None
+        colors = np.clip(found.vertex.colors.numpy(), 0, 1) if with_color and len(vertices) else None
         whole = TriangleMesh(vertices, faces, colors)
         mesh, clusters, kept = largest_pieces(whole, settings.keep_clusters, settings.min_triangles)
         if len(mesh.faces) == 0:
@@ -174,11 +167,45 @@ class _Fusion:
             )
         return MeshResult(mesh, self.voxel, self.depth_trunc, clusters, kept)
 
+    def _integrated(self, with_color: bool) -> Any:
+        """The VoxelBlockGrid with every view in it."""
+        open3d = import_open3d()
+        number = open3d.core.float32
+        shapes = {"tsdf": (1), "weight": (1)} | ({"color": (3)} if with_color else {})
+        # Integration first asks for room for all blocks of its view, known or not.
+        capacity = len(self._blocks) + max(len(observation.blocks) for observation in self.observations)
+        grid = open3d.t.geometry.VoxelBlockGrid(
+            tuple(shapes), (number,) * len(shapes), tuple(shapes.values()), self.voxel, BLOCK, capacity
+        )
+        for observation in self.observations:
+            self._integrate(open3d, grid, observation)
+        return grid
+
+    def _integrate(self, open3d: ModuleType, grid: Any, observation: _Observation) -> None:
+        """Add one view. Open3D truncates pixel coordinates: pixel edges at integers, as in our cameras."""
+        camera, tensor = observation.camera, open3d.core.Tensor
+        images = [open3d.t.geometry.Image(observation.depth)]
+        if observation.pixels is not None:
+            images.append(open3d.t.geometry.Image(observation.pixels.astype(np.float32) / 255))
+        intrinsic = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
+        extrinsic = np.eye(4)
+        extrinsic[:3, :3], extrinsic[:3, 3] = camera.rotation.numpy(), camera.translation.numpy()
+        scale, truncation = 1.0, self.settings.truncation_voxels
+        blocks = tensor(unpacked(observation.blocks))
+        grid.integrate(blocks, *images, tensor(intrinsic), tensor(extrinsic), scale, self.depth_trunc, truncation)
+
+
+def _to_bytes(image: Tensor) -> np.ndarray:
+    """(3, H, W) in [0, 1] to (H, W, 3) uint8: a quarter of the memory while the views wait."""
+    return (image.detach().clamp(0, 1) * 255).round().to(torch.uint8).permute(1, 2, 0).contiguous().numpy()
+
 
 def fusion_lengths(cameras: Sequence[Camera], settings: TsdfSettings) -> tuple[float, float]:
     """(depth_trunc, voxel) in world units, derived where the settings say 0."""
-    depth_trunc = settings.depth_trunc or settings.depth_trunc_radii * focus_region(cameras).radius
-    voxel = settings.voxel or depth_trunc / settings.resolution
+    radius = focus_region(cameras).radius
+    depth_trunc = settings.depth_trunc or settings.depth_trunc_radii * radius
+    pixel = radius / float(np.median([camera.fx for camera in cameras]))  # its size at the radius
+    voxel = settings.voxel or max(depth_trunc / settings.resolution, settings.finest_pixels * pixel)
     if not (0 < voxel < depth_trunc < float("inf")):
         raise RtgsError(
             f"mesh: voxel {voxel:g} and depth_trunc {depth_trunc:g} must satisfy 0 < voxel < depth_trunc; "
@@ -204,14 +231,14 @@ def usable_depth(view: DepthView, depth_trunc: float, min_alpha: float) -> np.nd
 
 
 def blocks_near_surface(camera: Camera, depth: np.ndarray, voxel: float, truncation_voxels: float) -> np.ndarray:
-    """(B, 3) int32 indices of the blocks within the truncation distance of the observed surface along its rays.
+    """(B,) packed indices of the blocks within the truncation distance of the observed surface along its rays.
 
     Every pixel is used (Open3D's own search takes every fourth, which leaves holes when a block is smaller than four
     pixels' footprint).
     """
     rows, columns = np.nonzero(depth)
     if len(rows) == 0:
-        return np.empty((0, 3), np.int32)
+        return np.empty(0, np.int64)
     rays = camera.rays(torch.float64)
     directions = rays.directions.numpy()[rows, columns]
     side, truncation = BLOCK * voxel, truncation_voxels * voxel
@@ -222,14 +249,14 @@ def blocks_near_surface(camera: Camera, depth: np.ndarray, voxel: float, truncat
     for offset in np.linspace(-truncation, truncation, steps):
         z = np.maximum(depth[rows, columns] + offset, 0.0)
         indices = np.floor((rays.origin.numpy() + z[:, None] * directions) / side).astype(np.int64)
-        found.append(np.unique(_packed(indices)))
-    return _unpacked(np.unique(np.concatenate(found)))
+        found.append(np.unique(packed(indices)))
+    return np.unique(np.concatenate(found))
 
 
 _KEY_BITS = 21  # of each coordinate of a block index; sorting one integer is many times faster than sorting rows
 
 
-def _packed(indices: np.ndarray) -> np.ndarray:
+def packed(indices: np.ndarray) -> np.ndarray:
     """(B, 3) block indices as one int64 each."""
     limit = 1 << (_KEY_BITS - 1)
     if np.abs(indices).max() >= limit:
@@ -241,8 +268,8 @@ def _packed(indices: np.ndarray) -> np.ndarray:
     return (shifted[:, 0] << (2 * _KEY_BITS)) | (shifted[:, 1] << _KEY_BITS) | shifted[:, 2]
 
 
-def _unpacked(keys: np.ndarray) -> np.ndarray:
-    """Inverse of :func:`_packed`, int32."""
+def unpacked(keys: np.ndarray) -> np.ndarray:
+    """Inverse of :func:`packed`, int32."""
     limit, field = 1 << (_KEY_BITS - 1), (1 << _KEY_BITS) - 1
     parts = [keys >> (2 * _KEY_BITS), (keys >> _KEY_BITS) & field, keys & field]
     return (np.stack(parts, axis=1) - limit).astype(np.int32)

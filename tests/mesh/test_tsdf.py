@@ -17,7 +17,9 @@ from rtgs.mesh.tsdf import (
     blocks_near_surface,
     focus_region,
     fuse_depths,
+    fusion_lengths,
     largest_pieces,
+    unpacked,
     usable_depth,
 )
 from tests.mesh.shapes import box, camera_at, join, sphere, sphere_depths
@@ -73,6 +75,9 @@ def test_derived_lengths_are_those_of_2dgs() -> None:
     result = fused(views, TsdfSettings(resolution=96))
     assert result.depth_trunc == pytest.approx(6.0)
     assert result.voxel == pytest.approx(6.0 / 96)
+    cameras = [view.camera for view in views]
+    assert fusion_lengths(cameras, TsdfSettings())[1] == pytest.approx(3.0 / 150)  # a pixel seen from the radius
+    assert fusion_lengths(cameras, TsdfSettings(finest_pixels=0))[1] == pytest.approx(6.0 / 1024)
 
 
 def test_parallel_axes_have_a_finite_region() -> None:
@@ -103,7 +108,7 @@ def test_every_block_with_a_surface_point_is_found() -> None:
     view = sphere_view(cameras_around(3)[0])
     voxel = 0.004
     depth = usable_depth(view, 6.0, 0.5)
-    blocks = {tuple(block) for block in blocks_near_surface(view.camera, depth, voxel, 5.0)}
+    blocks = {tuple(block) for block in unpacked(blocks_near_surface(view.camera, depth, voxel, 5.0))}
     rays = view.camera.rays(torch.float64)
     points = (rays.origin + view.depth.double()[..., None] * rays.directions)[view.depth > 0].numpy()
     assert {tuple(block) for block in np.floor(points / (8 * voxel)).astype(int)} <= blocks
@@ -126,7 +131,7 @@ def test_what_cannot_be_fused_is_explained() -> None:
         fused([DepthView(view.camera, torch.zeros_like(view.depth))], TsdfSettings(depth_trunc=6.0))
     with pytest.raises(RtgsError, match="no training views"):
         fuse_depths([], [])
-    with pytest.raises(ValueError, match="has no image although the first view has one"):
+    with pytest.raises(ValueError, match="either every view has an image or none"):
         fused([view, DepthView(view.camera, view.depth)], TsdfSettings(depth_trunc=6.0, voxel=0.1))
     with pytest.raises(RtgsError, match="max_blocks is 10"):
         fused([view], TsdfSettings(depth_trunc=6.0, voxel=0.05, max_blocks=10))
