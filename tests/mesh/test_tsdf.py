@@ -61,6 +61,9 @@ def test_sphere_is_recovered_within_a_voxel() -> None:
     assert np.abs(distance).max() < 1.5 * result.voxel
     assert np.linalg.norm(result.mesh.vertices.mean(0)) < 0.1 * result.voxel  # half a pixel off would show here
     assert result.kept == 1
+    corners = result.mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    _, uses = np.unique(np.sort(corners, axis=1), axis=0, return_counts=True)
+    assert (uses == 2).all()  # watertight: no cracks between blocks
     volume = np.einsum("ij,ij->i", result.mesh.face_normals(), result.mesh.vertices[result.mesh.faces[:, 0]]).sum() / 6
     assert volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.03)  # closed, and normals point outwards
     assert result.mesh.colors is not None
