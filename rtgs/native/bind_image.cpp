@@ -2,6 +2,7 @@
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/pair.h>
 
+#include <algorithm>
 #include <optional>
 #include <vector>
 
@@ -27,18 +28,18 @@ double total(const std::vector<double>& rows) {  // in a fixed order, whatever t
 
 float* pointer(std::optional<Floats>& array) { return array ? array->data() : nullptr; }
 
-ViewArguments view_of(const Floats& picture, const Floats& rotation, const Floats& intrinsics) {
+ViewArguments view_of(const Floats& picture, const Floats& rotation, const float* intrinsics) {
   ViewArguments view{};
   view.height = int(picture.shape(1));
   view.width = int(picture.shape(2));
   for (int i = 0; i < 9; ++i) view.rotation[i] = rotation.data()[i];
-  const float* k = intrinsics.data();
-  view.focal_x = k[0], view.focal_y = k[1], view.center_x = k[2], view.center_y = k[3];
+  if (const float* k = intrinsics) view.focal_x = k[0], view.focal_y = k[1], view.center_x = k[2], view.center_y = k[3];
   return view;
 }
 
 std::pair<double, double> photometric_loss(Floats image, Floats target, float l1, float dssim, bool with_dssim,
-                                           std::optional<Floats> gradient, std::optional<Floats> dissimilarity, int threads) {
+                                           std::optional<Floats> gradient, std::optional<Floats> dissimilarity,
+                                           int threads) {
   PhotometricArguments a{};
   a.image = image.data();
   a.target = target.data();
@@ -60,10 +61,11 @@ std::pair<double, double> photometric_loss(Floats image, Floats target, float l1
 }
 
 double normal_consistency_loss(Floats normal, Floats depth, Floats alpha, bool depth_is_surface, Floats rotation,
-                               Floats intrinsics, float near_depth, float inverse_depth_range, std::optional<Floats> gradient_normal,
-                               std::optional<Floats> gradient_depth, std::optional<Floats> gradient_alpha, int threads) {
+                               Floats intrinsics, float near_depth, float inverse_depth_range,
+                               std::optional<Floats> gradient_normal, std::optional<Floats> gradient_depth,
+                               std::optional<Floats> gradient_alpha, int threads) {
   NormalArguments a{};
-  a.view = view_of(normal, rotation, intrinsics);
+  a.view = view_of(normal, rotation, intrinsics.data());
   a.normal = normal.data();
   a.depth = depth.data();
   a.alpha = alpha.data();
@@ -86,8 +88,7 @@ double normal_consistency_loss(Floats normal, Floats depth, Floats alpha, bool d
 double mono_normal_loss(Floats normal, Floats mono, std::optional<Floats> weight, Floats rotation, float l1,
                         std::optional<Floats> gradient_normal, int threads) {
   MonoNormalArguments a{};
-  Floats intrinsics = rotation;  // not used by this loss
-  a.view = view_of(normal, rotation, intrinsics);
+  a.view = view_of(normal, rotation, nullptr);
   a.normal = normal.data();
   a.mono = mono.data();
   a.weight = pointer(weight);
@@ -103,19 +104,41 @@ double mono_normal_loss(Floats normal, Floats mono, std::optional<Floats> weight
   return total(rows) / count;
 }
 
+// Nearest-rank 1st and 99th percentile of the positive surface depths on every `step`-th pixel of every `step`-th row.
+std::pair<float, float> depth_percentiles(Floats depth, std::optional<Floats> alpha, float least_alpha, int step) {
+  nb::gil_scoped_release release;
+  long height = long(depth.shape(0)), width = long(depth.shape(1));
+  std::vector<float> values;
+  values.reserve(size_t((height / step + 1) * (width / step + 1)));
+  for (long y = 0; y < height; y += step)
+    for (long i = y * width; i < (y + 1) * width; i += step) {
+      float value = depth.data()[i];
+      if (alpha) value = alpha->data()[i] > least_alpha ? value / alpha->data()[i] : 0.f;
+      if (value > 0) values.push_back(value);
+    }
+  if (values.empty()) return {0.f, 0.f};
+  long last = long(values.size()) - 1, low = long(0.01 * last + 0.5), high = long(0.99 * last + 0.5);
+  std::nth_element(values.begin(), values.begin() + low, values.end());
+  float near = values[low];
+  std::nth_element(values.begin() + low, values.begin() + high, values.end());
+  return {near, values[high]};
+}
+
 }  // namespace
 
 void bind_image(nb::module_& m) {
   using nb::arg;
   m.def("photometric_loss", &photometric_loss, arg("image"), arg("target"), arg("l1"), arg("dssim"), arg("with_dssim"),
         arg("gradient").none(), arg("dissimilarity").none(), arg("threads"),
-        "Mean |image - target| and mean 1 - SSIM (0 unless asked for); fills the gradient of l1 * first + dssim * second.");
-  m.def("normal_consistency_loss", &normal_consistency_loss, arg("normal"), arg("depth"), arg("alpha"), arg("depth_is_surface"),
-        arg("rotation"), arg("intrinsics"), arg("near_depth"), arg("inverse_depth_range"), arg("gradient_normal").none(),
-        arg("gradient_depth").none(), arg("gradient_alpha").none(), arg("threads"),
+        "Mean |image - target|, mean 1 - SSIM (0 if not asked for); fills the gradient of l1 * first + dssim * second.");
+  m.def("normal_consistency_loss", &normal_consistency_loss, arg("normal"), arg("depth"), arg("alpha"),
+        arg("depth_is_surface"), arg("rotation"), arg("intrinsics"), arg("near_depth"), arg("inverse_depth_range"),
+        arg("gradient_normal").none(), arg("gradient_depth").none(), arg("gradient_alpha").none(), arg("threads"),
         "Mean of weight (1 - alpha normal . depth normal); intrinsics = fx, fy, cx, cy; fills the gradients.");
-  m.def("mono_normal_loss", &mono_normal_loss, arg("normal"), arg("mono"), arg("weight").none(), arg("rotation"), arg("l1"),
-        arg("gradient_normal").none(), arg("threads"),
+  m.def("depth_percentiles", &depth_percentiles, arg("depth"), arg("alpha").none(), arg("least_alpha"), arg("step"),
+        "1st and 99th percentile of the positive depth / alpha (depth itself without alpha) over a grid of pixels.");
+  m.def("mono_normal_loss", &mono_normal_loss, arg("normal"), arg("mono"), arg("weight").none(), arg("rotation"),
+        arg("l1"), arg("gradient_normal").none(), arg("threads"),
         "Mean of weight (1 - n . mono + l1 |n - mono|_1), n the normal turned to the camera frame and normalised.");
 }
 

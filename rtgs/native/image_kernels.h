@@ -3,12 +3,14 @@
 
 namespace rtgs {
 
-// What every thread of the photometric kernel works in: floats, rows padded on both sides by kRowPad zeros.
-constexpr int kRowPad = 16;           // at least the blur's radius; whole registers of every instruction set
-constexpr int kBlurRows = 16;         // rows blurred down the columns: 4 rows of 4 maps
-constexpr int kRingSlots = 20;        // rows of gradient maps kept: radius + group + radius + group - 1 = 17, up to groups of 4
+constexpr int kRowPad = 16;  // zeros on both sides of a working row: whole registers of every instruction set
+// An odd number of cache lines, so that rows below each other do not compete for the same few cache sets.
+static inline int padded_width(int width) { return (((width + 15) / 16 + 2 * kRowPad / 16) | 1) * 16; }
+
+// What every thread of the photometric kernel works in, in floats.
+constexpr int kBlurRows = 16;   // rows blurred down the columns: 4 rows of 4 maps
+constexpr int kRingSlots = 20;  // rows of gradient maps kept: radius + group + radius + group - 1 = 17, groups of 4
 constexpr int kGradientMaps = 3;
-static inline int padded_width(int width) { return (width + 15) / 16 * 16 + 2 * kRowPad; }
 static inline long photometric_scratch(int width) {
   return long(padded_width(width)) * (kBlurRows + kGradientMaps * (kRingSlots + 1));
 }

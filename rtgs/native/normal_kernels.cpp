@@ -1,8 +1,8 @@
 // Losses on normals and their gradients (methods.md 3.1 "Post", 5).
 //
-// Depth normal. With z+-, w+- the surface depths of the right/left and lower/upper neighbours and c = (u, v, 1) the pixel's
-// camera ray, the central differences of the back-projected points are a c + b e1 and p c + q e2 with a = z+ - z-,
-// b = (z+ + z-) / fx, p = w+ - w-, q = (w+ + w-) / fy. Their cross product (down x right) divided by b q is
+// Depth normal. With z+-, w+- the surface depths of the right/left and lower/upper neighbours and c = (u, v, 1) the
+// pixel's camera ray, the central differences of the back-projected points are a c + b e1 and p c + q e2 with
+// a = z+ - z-, b = (z+ + z-) / fx, p = w+ - w-, q = (w+ + w-) / fy. Their cross product, down x right, over b q is
 //   n = (alpha, beta, -(1 + alpha u + beta v)),  alpha = fx (z+ - z-) / (z+ + z-),  beta = fy (w+ - w-) / (w+ + w-),
 // which has no unit and n . c = -1: it always faces the camera, its length is at least 1 / |c|, and nothing over- or
 // underflows whatever the scale of the scene. Where either sum is 0 there is no surface and the depth normal is zero.
@@ -24,10 +24,12 @@ struct Vector {
 };
 inline vfloat dot(const Vector& a, const Vector& b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
 inline Vector to_camera(const float* r, const Vector& v) {
-  return {r[0] * v.x + r[1] * v.y + r[2] * v.z, r[3] * v.x + r[4] * v.y + r[5] * v.z, r[6] * v.x + r[7] * v.y + r[8] * v.z};
+  return {r[0] * v.x + r[1] * v.y + r[2] * v.z, r[3] * v.x + r[4] * v.y + r[5] * v.z,
+          r[6] * v.x + r[7] * v.y + r[8] * v.z};
 }
 inline Vector to_world(const float* r, const Vector& v) {
-  return {r[0] * v.x + r[3] * v.y + r[6] * v.z, r[1] * v.x + r[4] * v.y + r[7] * v.z, r[2] * v.x + r[5] * v.y + r[8] * v.z};
+  return {r[0] * v.x + r[3] * v.y + r[6] * v.z, r[1] * v.x + r[4] * v.y + r[7] * v.z,
+          r[2] * v.x + r[5] * v.y + r[8] * v.z};
 }
 inline vfloat load_columns(const float* p, int count) { return count >= kLanes ? load(p) : load_first(p, count); }
 inline void store_columns(float* p, vfloat v, int count) { count >= kLanes ? store(p, v) : store_first(p, v, count); }
@@ -69,7 +71,8 @@ double normal_row(const NormalArguments& a, const Rings& rings, int y, bool own)
   const ViewArguments& view = a.view;
   int width = view.width;
   long plane = long(view.height) * width, at = long(y) * width;
-  const float *here = rings.row(Rings::kDepth, y), *below = rings.row(Rings::kDepth, y + 1), *above = rings.row(Rings::kDepth, y - 1);
+  const float *above = rings.row(Rings::kDepth, y - 1), *here = rings.row(Rings::kDepth, y);
+  const float* below = rings.row(Rings::kDepth, y + 1);
   bool inner_row = y > 0 && y < view.height - 1;
   float v = (float(y) + 0.5f - view.center_y) / view.focal_y;
   vfloat one = broadcast(1.f), total{};
@@ -79,8 +82,8 @@ double normal_row(const NormalArguments& a, const Rings& rings, int y, bool own)
     vfloat u = (column + (0.5f - view.center_x)) * (1.f / view.focal_x);
     vfloat right = load(here + x + 1), left = load(here + x - 1), down = load(below + x), up = load(above + x);
     vfloat sum_x = right + left, sum_y = down + up, least = broadcast(kLeastDepth);
-    vmask valid = gt(sum_x, least) & gt(sum_y, least) & gt(column, broadcast(0.5f)) & lt(column, broadcast(width - 1.5f));
-    if (!inner_row) valid = first_lanes(0);
+    vmask inner = gt(column, broadcast(0.5f)) & lt(column, broadcast(width - 1.5f));
+    vmask valid = inner_row ? gt(sum_x, least) & gt(sum_y, least) & inner : first_lanes(0);
     vfloat per_x = reciprocal(select(valid, sum_x, one)), per_y = reciprocal(select(valid, sum_y, one));
     vfloat slope_x = (view.focal_x * (right - left)) * per_x, slope_y = (view.focal_y * (down - up)) * per_y;
     Vector n = {slope_x, slope_y, -(one + slope_x * u + slope_y * v)};
@@ -100,7 +103,8 @@ double normal_row(const NormalArguments& a, const Rings& rings, int y, bool own)
     }
     vfloat by_length = push * per_length;  // zero where not valid
     Vector g = {by_length * (m.x - n.x * cosine), by_length * (m.y - n.y * cosine), by_length * (m.z - n.z * cosine)};
-    vfloat of_x = 2.f * view.focal_x * (g.x - u * g.z) * per_x, of_y = 2.f * view.focal_y * (g.y - v * g.z) * per_y;
+    vfloat of_x = 2.f * view.focal_x * (g.x - u * g.z) * per_x;  // d slope_x / d right = 2 fx left / (right + left)^2
+    vfloat of_y = 2.f * view.focal_y * (g.y - v * g.z) * per_y;
     store(rings.row(Rings::kRight, y) + x, where(valid, of_x * (left * per_x)));
     store(rings.row(Rings::kLeft, y) + x, where(valid, -of_x * (right * per_x)));
     store(rings.row(Rings::kDown, y) + x, where(valid, of_y * (up * per_y)));

@@ -1,6 +1,7 @@
 // L1 + D-SSIM with its gradient in one sweep (Wang et al. 2004; window and constants of methods.md 9).
 //
-// With s = x + y and d = x - y, everything SSIM needs is in four blurred maps: s, d, s^2, d^2. Their means and variances give
+// With s = x + y and d = x - y, all that SSIM needs is in four blurred maps: s, d, s^2, d^2. Their means and variances
+// give
 //   A1 = 2 mu_x mu_y + C1 = B1 - mu_d^2        B1 = (mu_s^2 + mu_d^2) / 2 + C1
 //   A2 = 2 cov_xy + C2    = B2 - var_d         B2 = (var_s + var_d) / 2 + C2
 //   1 - SSIM = 1 - A1 A2 / (B1 B2) = mu_d^2 / B1 + var_d A1 / (B1 B2)
@@ -13,6 +14,10 @@
 // The sweep goes down the image in groups of kGroup rows. Each blur runs down the columns first, straight from the
 // images, into padded rows that stay in L1, then along the rows. The M maps live in a ring of rows in L2, a few rows
 // ahead of the gradient. Chunks of rows recompute their halo, so that no result depends on how many chunks there are.
+//
+// Measured and left out: statistics of the target kept per view (8 % at 400x300, 4 % at 800x600, for twice the target's
+// memory); tiles of columns (8 to 20 % slower); shuffles instead of unaligned loads along the rows (no difference:
+// the sweep runs at the rate of its multiply-adds).
 #include "image_kernels.h"
 #include "simd.h"
 
@@ -206,15 +211,16 @@ void sweep(const PhotometricArguments& a, const Plane& p, int channel, int first
       for (int r = 0; r < kGroup && ready + r < a.height; ++r) {
         bool own = ready + r >= first && ready + r < end;
         long row = plane_rows + ready + r;
-        double total = similarity_along<Gradient>(p, r, ready + r, own && a.dissimilarity ? a.dissimilarity + row * a.width : nullptr);
+        float* picture = own && a.dissimilarity ? a.dissimilarity + row * a.width : nullptr;
+        double total = similarity_along<Gradient>(p, r, ready + r, picture);
         if (own) a.dssim_rows[row] = total;
       }
     }
     if (Gradient) gradient_down(p, y);
     for (int r = 0; r < kGroup && y + r < end; ++r) {
-      long row = plane_rows + y + r;
-      a.l1_rows[row] = Gradient ? gradient_along(p, a, r, y + r, a.gradient + row * a.width)
-                                : difference_row(a.image + row * a.width, a.target + row * a.width, a.width, 0.f, nullptr);
+      long row = plane_rows + y + r, at = row * a.width;
+      a.l1_rows[row] = Gradient ? gradient_along(p, a, r, y + r, a.gradient + at)
+                                : difference_row(a.image + at, a.target + at, a.width, 0.f, nullptr);
     }
   }
 }
@@ -227,7 +233,8 @@ void photometric(const PhotometricArguments& a) {
 #pragma omp parallel for num_threads(a.threads) if (a.threads > 1)
     for (int row = 0; row < rows; ++row) {
       long at = long(row) * a.width;
-      a.l1_rows[row] = difference_row(a.image + at, a.target + at, a.width, a.l1_scale, a.gradient ? a.gradient + at : nullptr);
+      float* gradient = a.gradient ? a.gradient + at : nullptr;
+      a.l1_rows[row] = difference_row(a.image + at, a.target + at, a.width, a.l1_scale, gradient);
     }
     return;
   }

@@ -86,7 +86,7 @@ def normal_consistency_loss(
     surface = depth if depth_override is None else depth_override
     near, inverse_range = 0.0, 0.0
     if inverse_depth_weight:
-        near, inverse_range = _depth_ramp(surface, alpha, depth_override is not None)
+        near, inverse_range = _depth_ramp(surface, alpha if depth_override is None else None)
     return _NormalConsistency.apply(
         normal, surface, alpha, depth_override is not None, _rotation(camera), _intrinsics(camera), near, inverse_range
     )
@@ -148,27 +148,26 @@ def depth_normals(depth: Tensor, camera: Camera) -> Tensor:
     return torch.einsum("cw,chx->whx", camera.rotation.to(depth.dtype), unit)
 
 
-def inverse_depth_weights(depth: Tensor, alpha: Tensor) -> Tensor:
-    """(H, W) 1 - (d - p1) / (p99 - p1) clipped to 0..1 (EnvGS, methods.md 5), no gradient; d = depth / alpha.
+def inverse_depth_weights(depth: Tensor, alpha: Tensor | None = None) -> Tensor:
+    """(H, W) 1 - (d - p1) / (p99 - p1) clipped to 0..1 (EnvGS, methods.md 5), no gradient.
 
-    The percentiles are those of the covered pixels (d > 0: empty ones say nothing of the scene's depth), nearest rank,
-    over a regular grid of about PERCENTILE_SAMPLES pixels. 1 everywhere when no depth varies.
+    d = depth / alpha, or ``depth`` itself without ``alpha``; both (H, W) float32. The percentiles are those of the
+    covered pixels (d > 0: empty ones say nothing of the scene's depth), nearest rank, over a regular grid of about
+    PERCENTILE_SAMPLES pixels. 1 everywhere when no depth varies.
     """
-    near, inverse_range = _depth_ramp(depth, alpha, False)
-    return (1 - (surface_depth(depth.detach(), alpha.detach()) - near) * inverse_range).clamp_(0, 1)
+    if depth.ndim != 2:
+        raise ValueError(f"depth must be (H, W), got {tuple(depth.shape)}")
+    for name, value in (("depth", depth), ("alpha", depth if alpha is None else alpha)):
+        _check_map(name, value, tuple(depth.shape))
+    near, inverse_range = _depth_ramp(depth, alpha)
+    surface = depth.detach() if alpha is None else surface_depth(depth.detach(), alpha.detach())
+    return (1 - (surface - near) * inverse_range).clamp_(0, 1)
 
 
-def _depth_ramp(depth: Tensor, alpha: Tensor, is_surface: bool) -> tuple[float, float]:
-    """First percentile p1 of the surface depth and 1 / (p99 - p1), 0 when that range is empty."""
+def _depth_ramp(depth: Tensor, alpha: Tensor | None) -> tuple[float, float]:
+    """First percentile p1 of the depth (divided by alpha, if given) and 1 / (p99 - p1), 0 when that range is empty."""
     step = max(1, math.ceil(math.sqrt(depth.numel() / PERCENTILE_SAMPLES)))
-    sample = depth.detach()[::step, ::step]
-    if not is_surface:
-        sample = surface_depth(sample, alpha.detach()[::step, ::step])
-    values = sample[sample > 0]
-    if values.numel() == 0:
-        return 0.0, 0.0
-    last = values.numel() - 1
-    low, high = (float(values.kthvalue(1 + round(last * share)).values) for share in (0.01, 0.99))
+    low, high = core.depth_percentiles(_data(depth), None if alpha is None else _data(alpha), MIN_ALPHA, step)
     return low, 1 / (high - low) if high > low else 0.0
 
 

@@ -6,12 +6,14 @@ shared.
 
 from __future__ import annotations
 
+import math
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from rtgs.cameras import Camera
-from rtgs.train.losses import PhotometricLoss, inverse_depth_weights, surface_depth
+from rtgs.train.losses import PERCENTILE_SAMPLES, PhotometricLoss, surface_depth
 
 WINDOW_RADIUS = 5
 WINDOW_SIGMA = 1.5
@@ -69,17 +71,25 @@ def normal_consistency_loss(
     surface = surface_depth(depth, alpha) if depth_override is None else depth_override
     loss = 1 - (normal * alpha.detach() * depth_normals(surface, camera)).sum(dim=0)
     if inverse_depth_weight:
-        covered = torch.ones_like(surface)
-        loss = loss * (
-            inverse_depth_weights(depth, alpha) if depth_override is None else inverse_depth_weights(surface, covered)
-        )
+        loss = loss * inverse_depth_weights(surface)
     return loss.mean()
+
+
+def inverse_depth_weights(depth: Tensor, alpha: Tensor | None = None) -> Tensor:
+    """Twin of :func:`rtgs.train.losses.inverse_depth_weights`."""
+    surface = (depth if alpha is None else surface_depth(depth, alpha)).detach()
+    step = max(1, math.ceil(math.sqrt(surface.numel() / PERCENTILE_SAMPLES)))
+    sample = surface[::step, ::step]
+    ordered = sample[sample > 0].sort().values
+    if len(ordered) == 0:
+        return torch.ones_like(surface)
+    low, high = (ordered[int(0.5 + share * (len(ordered) - 1))] for share in (0.01, 0.99))
+    return (1 - (surface - low) / (high - low)).clamp(0, 1) if high > low else torch.ones_like(surface)
 
 
 def depth_normals(depth: Tensor, camera: Camera) -> Tensor:
     """(3, H, W) unit world normals of a surface depth (H, W): back-projection, central differences, cross product."""
-    rays = camera.rays(depth.dtype)
-    points = rays.origin + depth[..., None] * rays.directions
+    points = depth[..., None] * camera.rays(depth.dtype).directions  # from the camera centre, which differences cancel
     inner = torch.zeros(3, *depth.shape, dtype=depth.dtype)
     if min(depth.shape) < 3:
         return inner + 0 * depth.sum()  # no pixel with four neighbours; still connected to depth

@@ -50,12 +50,12 @@ def leaves(tensors, dtype=torch.float32) -> list[torch.Tensor]:
     return [tensor.to(dtype, copy=True).requires_grad_() for tensor in tensors]
 
 
-def assert_gradients_close(native, twin, relative: float) -> None:
+def assert_gradients_close(native, twin, relative: float, floor: float = 1e-12) -> None:
     for ours, exact in zip(native, twin, strict=True):
         assert (ours.grad is None) == (exact.grad is None)
         if ours.grad is not None:
             assert torch.isfinite(ours.grad).all()
-            assert (ours.grad - exact.grad).abs().max() <= relative * exact.grad.abs().max() + 1e-12
+            assert (ours.grad - exact.grad).abs().max() <= relative * exact.grad.abs().max() + floor
 
 
 # ---- photometric -------------------------------------------------------------------------------------------
@@ -138,10 +138,10 @@ def test_ssim_agrees_with_scikit_image_inside():
     generator = torch.Generator().manual_seed(3)
     image = torch.rand(40, 60, generator=generator)
     target = (image + 0.2 * torch.randn(40, 60, generator=generator)).clamp(0, 1)
-    _, expected = structural_similarity(
+    expected = structural_similarity(
         image.double().numpy(), target.double().numpy(), gaussian_weights=True, sigma=1.5,
         use_sample_covariance=False, data_range=1.0, full=True,
-    )  # fmt: skip
+    )[1]  # fmt: skip
     ours = losses.ssim_map(image[None], target[None])[0]
     assert (ours[5:-5, 5:-5] - torch.from_numpy(expected)[5:-5, 5:-5]).abs().max() < 1e-5  # the padding differs outside
     assert float(losses.ssim(image[None], target[None])) == pytest.approx(float(ours.mean()), abs=1e-6)
@@ -199,7 +199,7 @@ def test_normal_consistency_equals_its_twin(isa, size, empty, scale, override, i
     (native, ours), (twin, exact) = results
     assert float(native.detach()) == pytest.approx(float(twin.detach()), rel=1e-5, abs=1e-6)
     used = [0, 3] if override else [0, 1, 2]
-    assert_gradients_close([ours[i] for i in used], [exact[i] for i in used], 5e-5)
+    assert_gradients_close([ours[i] for i in used], [exact[i] for i in used], 5e-5, floor=1e-10 / scale)
 
 
 def test_normal_twins_pass_gradcheck():
@@ -269,8 +269,10 @@ def test_inverse_depth_weights_fall_from_near_to_far():
     depth = torch.linspace(1, 101, 200 * 200).view(200, 200)
     weights = losses.inverse_depth_weights(depth, torch.ones_like(depth))
     torch.testing.assert_close(weights, (1 - (depth - 2) / 98).clamp(0, 1), atol=0.01, rtol=0)  # a grid of samples
-    flat = losses.inverse_depth_weights(torch.full((4, 5), 3.0), torch.ones(4, 5))
-    assert (flat == 1).all()
+    assert (losses.inverse_depth_weights(torch.full((4, 5), 3.0)) == 1).all()
+    depth, alpha = make_view(90, 150, torch.Generator().manual_seed(12), 0.3)[1:]
+    twin = reference_losses.inverse_depth_weights(depth.double(), alpha.double())
+    torch.testing.assert_close(losses.inverse_depth_weights(depth, alpha).double(), twin, atol=1e-5, rtol=0)
 
 
 def test_surface_depth_mixes_expected_and_median():
@@ -383,6 +385,8 @@ def test_wrong_inputs_are_named():
         (lambda: losses.mono_normal_loss(image, flat, camera), "mono_normal"),
         (lambda: losses.mono_normal_loss(image, image, camera, form="l2"), "cosine"),
         (lambda: losses.mono_normal_loss(image, image, camera, weight=image), "weight"),
+        (lambda: losses.inverse_depth_weights(image), "depth"),
+        (lambda: losses.inverse_depth_weights(flat, flat.T), "alpha"),
     ]:
         with pytest.raises(ValueError, match=message):
             call()
