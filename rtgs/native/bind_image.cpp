@@ -130,7 +130,7 @@ void bind_image(nb::module_& m) {
   using nb::arg;
   m.def("photometric_loss", &photometric_loss, arg("image"), arg("target"), arg("l1"), arg("dssim"), arg("with_dssim"),
         arg("gradient").none(), arg("dissimilarity").none(), arg("threads"),
-        "Mean |image - target|, mean 1 - SSIM (0 if not asked for); fills the gradient of l1 * first + dssim * second.");
+        "Mean |image - target|, mean 1 - SSIM (0 unless wanted); fills the gradient of l1 * first + dssim * second.");
   m.def("normal_consistency_loss", &normal_consistency_loss, arg("normal"), arg("depth"), arg("alpha"),
         arg("depth_is_surface"), arg("rotation"), arg("intrinsics"), arg("near_depth"), arg("inverse_depth_range"),
         arg("gradient_normal").none(), arg("gradient_depth").none(), arg("gradient_alpha").none(), arg("threads"),
