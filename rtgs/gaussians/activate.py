@@ -60,21 +60,20 @@ class _Activate(torch.autograd.Function):
             torch.get_num_threads(),
         )
         if saved is not None:
-            _, _, scales, opacities, _ = outputs
-            ctx.save_for_backward(*raw, scales, opacities, saved)
+            ctx.save_for_backward(*raw, outputs[2], saved)
             ctx.center, ctx.degree = center, degree
         return outputs
 
     @staticmethod
     @once_differentiable
     def backward(ctx, *upstream: Tensor):
-        *raw, scales, opacities, saved = ctx.saved_tensors
+        *raw, scales, saved = ctx.saved_tensors
         gradients = tuple(torch.empty_like(tensor, memory_format=torch.contiguous_format) for tensor in raw)
         core.activate_surfels_backward(
             arrays(tuple(raw)),
             ctx.center,
             ctx.degree,
-            *arrays((scales, opacities, saved)),
+            *arrays((scales, saved)),
             arrays(upstream),
             arrays(gradients),
             torch.get_num_threads(),

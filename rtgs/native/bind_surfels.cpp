@@ -70,8 +70,7 @@ void activate(const nb::tuple& raw, const nb::tuple& center, int degree, const n
 }
 
 void activate_backward(const nb::tuple& raw, const nb::tuple& center, int degree, const Floats& scales,
-                       const Floats& opacities, const Floats& saved, const nb::tuple& upstream,
-                       const nb::tuple& gradients, int threads) {
+                       const Floats& saved, const nb::tuple& upstream, const nb::tuple& gradients, int threads) {
   size_t count, gradient_count;
   Floats hold[6], gradient_hold[6];
   const RawSurfels in = checked_raw(raw, count, hold);
@@ -81,14 +80,13 @@ void activate_backward(const nb::tuple& raw, const nb::tuple& center, int degree
     throw std::invalid_argument("activate_surfels: gradients must have the shapes of the parameters");
   const ActivatedArrays a(upstream, count);
   require(scales, "scales", count, 2);
-  require(opacities, "opacities", count, 1);
   require(saved, "saved", saved_size(count), 1);
   const ActivatedGradients up = {a.tangent_u.data(), a.tangent_v.data(), a.scales.data(), a.opacities.data(),
                                  a.colors.data()};
   Floats(&g)[6] = gradient_hold;
   const RawGradients to = {g[0].data(), g[1].data(), g[2].data(), g[3].data(), g[4].data(), g[5].data()};
   nb::gil_scoped_release release;
-  RTGS_DISPATCH(activate_surfels_backward, shape, in, scales.data(), opacities.data(), saved.data(), up, to);
+  RTGS_DISPATCH(activate_surfels_backward, shape, in, scales.data(), saved.data(), up, to);
 }
 
 }  // namespace
@@ -99,7 +97,7 @@ void bind_surfels(nb::module_& m) {
         nb::arg("saved").none(), nb::arg("threads"),
         "Fills out = (tangent_u, tangent_v, scales, opacities, colors) from the six raw parameters; saved may be None.");
   m.def("activate_surfels_backward", &activate_backward, nb::arg("raw"), nb::arg("center"), nb::arg("degree"),
-        nb::arg("scales"), nb::arg("opacities"), nb::arg("saved"), nb::arg("upstream"), nb::arg("gradients"),
+        nb::arg("scales"), nb::arg("saved"), nb::arg("upstream"), nb::arg("gradients"),
         nb::arg("threads"), "Fills the six gradients from the upstream gradients of activate_surfels' outputs.");
 }
 

@@ -84,8 +84,8 @@ inline void activate_color(const ActivationShape& shape, const RawSurfels& in, c
   store_rows<3>(out.colors, color);
 }
 
-inline void shape_backward(const RawSurfels& in, const float* scales, const float* opacities,
-                           const ActivatedGradients& up, const RawGradients& out) {
+inline void shape_backward(const RawSurfels& in, const float* scales, const ActivatedGradients& up,
+                           const RawGradients& out) {
   vfloat q[4], u[3], v[3], g[4], s[2], gs[2], logs[2];
   load_rows<4>(in.quaternions, q);
   const vfloat inverse = normalize<4>(q);
@@ -105,8 +105,8 @@ inline void shape_backward(const RawSurfels& in, const float* scales, const floa
   load_rows<2>(in.log_scales, logs);
   for (int k = 0; k < 2; ++k) gs[k] = where(le(abs(logs[k]), broadcast(kLogScaleLimit)), gs[k] * s[k]);
   store_rows<2>(out.log_scales, gs);
-  const vfloat o = load(opacities);
-  store(out.opacity_logits, load(up.opacities) * o * (1.f - o));
+  const vfloat e = exp(-abs(load(in.opacity_logits))), one = 1.f + e;  // o (1 - o) without cancellation near o = 1
+  store(out.opacity_logits, load(up.opacities) * e / (one * one));
 }
 
 template <int Degree>
@@ -194,14 +194,13 @@ void activate_tail(const ActivationShape& shape, const RawSurfels& in, const Act
 }
 
 template <int Degree>
-void backward_tail(const ActivationShape& shape, const RawSurfels& in, const float* scales, const float* opacities,
-                   const float* saved, const ActivatedGradients& up, const RawGradients& out, int rows) {
+void backward_tail(const ActivationShape& shape, const RawSurfels& in, const float* scales, const float* saved,
+                   const ActivatedGradients& up, const RawGradients& out, int rows) {
   Padded raw, gradient;
   PaddedActivated g{};
-  float s[2 * kLanes] = {}, o[kLanes] = {};
+  float s[2 * kLanes] = {};
   const RawSurfels from = padded_rows(raw, in, rows, shape.rest);
   copy(s, scales, rows, 2);
-  copy(o, opacities, rows, 1);
   copy(g.tangent_u, up.tangent_u, rows, 3);
   copy(g.tangent_v, up.tangent_v, rows, 3);
   copy(g.scales, up.scales, rows, 2);
@@ -209,7 +208,7 @@ void backward_tail(const ActivationShape& shape, const RawSurfels& in, const flo
   copy(g.colors, up.colors, rows, 3);
   const RawGradients to = {gradient.means, gradient.log_scales, gradient.quaternions, gradient.opacity_logits,
                            gradient.sh_dc, gradient.sh_rest};
-  shape_backward(from, s, o, {g.tangent_u, g.tangent_v, g.scales, g.opacities, g.colors}, to);
+  shape_backward(from, s, {g.tangent_u, g.tangent_v, g.scales, g.opacities, g.colors}, to);
   color_backward<Degree>(shape, from, saved, g.colors, to);
   copy(out.means, to.means, rows, 3);
   copy(out.log_scales, to.log_scales, rows, 2);
@@ -245,8 +244,8 @@ void forward(const ActivationShape& shape, const RawSurfels& in, const Activated
 }
 
 template <int Degree>
-void backward(const ActivationShape& shape, const RawSurfels& in, const float* scales, const float* opacities,
-              const float* saved, const ActivatedGradients& up, const RawGradients& out) {
+void backward(const ActivationShape& shape, const RawSurfels& in, const float* scales, const float* saved,
+              const ActivatedGradients& up, const RawGradients& out) {
   const long blocks = (shape.count + kLanes - 1) / kLanes;
   const int threads = useful_threads(shape);
 #pragma omp parallel for schedule(static) num_threads(threads) if (threads > 1)
@@ -257,10 +256,10 @@ void backward(const ActivationShape& shape, const RawSurfels& in, const float* s
     const RawGradients to = rows_from(out, i, shape.rest);
     const float* kept = saved_of(const_cast<float*>(saved), i);
     if (i + kLanes <= shape.count) {
-      shape_backward(from, scales + 2 * i, opacities + i, g, to);
+      shape_backward(from, scales + 2 * i, g, to);
       color_backward<Degree>(shape, from, kept, g.colors, to);
     } else {
-      backward_tail<Degree>(shape, from, scales + 2 * i, opacities + i, kept, g, to, int(shape.count - i));
+      backward_tail<Degree>(shape, from, scales + 2 * i, kept, g, to, int(shape.count - i));
     }
   }
 }
@@ -275,12 +274,11 @@ void activate_surfels(const ActivationShape& shape, const RawSurfels& in, const 
 }
 
 void activate_surfels_backward(const ActivationShape& shape, const RawSurfels& in, const float* scales,
-                               const float* opacities, const float* saved, const ActivatedGradients& up,
-                               const RawGradients& out) {
-  if (shape.degree == 0) backward<0>(shape, in, scales, opacities, saved, up, out);
-  if (shape.degree == 1) backward<1>(shape, in, scales, opacities, saved, up, out);
-  if (shape.degree == 2) backward<2>(shape, in, scales, opacities, saved, up, out);
-  if (shape.degree == 3) backward<3>(shape, in, scales, opacities, saved, up, out);
+                               const float* saved, const ActivatedGradients& up, const RawGradients& out) {
+  if (shape.degree == 0) backward<0>(shape, in, scales, saved, up, out);
+  if (shape.degree == 1) backward<1>(shape, in, scales, saved, up, out);
+  if (shape.degree == 2) backward<2>(shape, in, scales, saved, up, out);
+  if (shape.degree == 3) backward<3>(shape, in, scales, saved, up, out);
 }
 
 }  // namespace rtgs::RTGS_ISA
