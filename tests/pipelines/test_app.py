@@ -160,6 +160,24 @@ def test_a_mesh_on_request(words, first, root):
     assert len(list(Store(root / "store").artifacts("train_diffuse"))) == 1
 
 
+def test_an_executed_run_is_tracked_with_its_steps(words, root):
+    assert main([*words, "tracking=jsonl", "seed=7"]) == 0
+    runs = {}
+    for path in (root / "tracking").rglob("events.jsonl"):
+        events = [json.loads(line) for line in path.read_text().splitlines()]
+        assert events[-1]["status"] == "finished"
+        runs[events[0]["name"].split()[0]] = (path.parent, events)
+    assert set(runs) == {"tiny_room-2dgs-smoke-seed7", "train_diffuse", "render", "evaluate", "report"}
+    folder, events = runs["tiny_room-2dgs-smoke-seed7"]
+    assert events[0]["tags"]["rtgs.method"] == "2dgs"
+    assert events[0]["tags"]["rtgs.step.train_diffuse"] == runs["train_diffuse"][1][0]["fingerprint"]
+    assert {event["name"] for event in events if event["kind"] == "table"} == {"plan", "eval"}
+    metrics = {key: event["step"] for event in events if event["kind"] == "metrics" for key in event["values"]}
+    assert metrics["train/loss"] == 12
+    assert metrics["eval/psnr"] is None
+    assert (folder / "artifacts" / "report.html").is_file()
+
+
 def test_sweeps_share_steps_and_end_with_a_table(words, first, root, capsys):
     assert main([*words, "--multirun", "ablation=none,no_normal_loss"]) == 0
     captured = capsys.readouterr()
