@@ -56,7 +56,8 @@ PixelRange pixel_range(vfloat low, vfloat high, int size) {
 }
 
 struct Projection {
-  vfloat fields[kChannels], depth_scale, depth, normal_sign;
+  vfloat fields[kChannels], depth_scale, depth;
+  vec3 normal;          // world, facing the camera
   vint x0, y0, x1, y1;  // tiles
   uint32_t visible;     // bit per lane
 };
@@ -70,7 +71,8 @@ Projection project_lanes(const RasterCamera& camera, const SurfelGeometry& g) {
   ScreenBound bound = screen_bound(camera, g, reach);
   out.depth = g.p.z;
   out.depth_scale = g.p.z * g.c[6];
-  out.normal_sign = normal_sign(g);
+  out.normal = normal_sign(g) * cross(g.tangent_u, g.tangent_v);
+  keep = keep & finite(out.normal.x) & finite(out.normal.y) & finite(out.normal.z);
   vfloat min_inverse = select(gt(out.depth_scale, broadcast(1e-37f)),
                               camera.near / max(out.depth_scale, broadcast(1e-37f)), broadcast(3e38f));
   const vfloat fields[kChannels] = {
@@ -98,19 +100,16 @@ bool all_finite(const float* values, int count) {
   return !any(mask_not(ok));
 }
 
-void write_channels(const RecordLayout& layout, const SurfelGeometry& g, const Projection& p, int lane,
-                    const float* features, float* channels) {
+void write_channels(const RecordLayout& layout, const Projection& p, int lane, const float* features,
+                    float* channels) {
   const int count = layout.normal ? layout.channels - 3 : layout.channels;
   for (int k = 0; k < count; ++k) channels[k] = features[k];
   for (int k = layout.channels; k < layout.padded_channels; ++k) channels[k] = 0.f;
   if (layout.normal) {
     float* normal = channels + count;
-    const float ux = g.tangent_u.x[lane], uy = g.tangent_u.y[lane], uz = g.tangent_u.z[lane];
-    const float vx = g.tangent_v.x[lane], vy = g.tangent_v.y[lane], vz = g.tangent_v.z[lane];
-    const float sign = p.normal_sign[lane];
-    normal[0] = sign * (uy * vz - uz * vy);
-    normal[1] = sign * (uz * vx - ux * vz);
-    normal[2] = sign * (ux * vy - uy * vx);
+    normal[0] = p.normal.x[lane];
+    normal[1] = p.normal.y[lane];
+    normal[2] = p.normal.z[lane];
   }
 }
 
@@ -138,7 +137,7 @@ void project_surfels(const RasterCamera& camera, const SurfelArrays& in, const P
       out.depths[id] = p.depth[lane];
       float* record = out.records + id * layout.record_stride;
       for (int k = 0; k < kChannels; ++k) record[k] = fields[k][lane];
-      write_channels(layout, g, p, lane, features, record + kChannels);
+      write_channels(layout, p, lane, features, record + kChannels);
       float* depth = record + kChannels + layout.padded_channels;
       if (layout.depth) {
         depth[0] = p.depth_scale[lane];
