@@ -38,6 +38,7 @@ class Divergence:
     terms: tuple[tuple[str, float], ...]  # every loss term of the step
     bad_terms: tuple[str, ...]
     surfels: tuple[BadSurfels, ...]
+    cause: str  # message of the part that noticed; empty for a loss
 
 
 class TrainingDiverged(RtgsError):
@@ -48,6 +49,8 @@ class TrainingDiverged(RtgsError):
         lines = [f"training diverged at step {divergence.step}, view {divergence.view!r}"]
         if divergence.bad_terms:
             lines.append(f"loss terms that are not finite: {', '.join(divergence.bad_terms)}")
+        if divergence.cause and not divergence.surfels:
+            lines.append(divergence.cause)
         lines.append("terms: " + ", ".join(f"{name} {value:.6g}" for name, value in divergence.terms))
         for bad in divergence.surfels:
             examples = "; ".join(f"surfel {index}: {value}" for index, value in zip(bad.ids, bad.values, strict=True))
@@ -73,11 +76,11 @@ def check_loss(terms: LossTerms, method: Method, step: int, view: str) -> float:
     raise diverged(terms, method, step, view)
 
 
-def diverged(terms: LossTerms, method: Method, step: int, view: str) -> TrainingDiverged:
+def diverged(terms: LossTerms, method: Method, step: int, view: str, *, cause: str = "") -> TrainingDiverged:
     """The report of a step whose loss or gradients (still in ``.grad``) are not finite."""
     bad = tuple(term.name for term in terms.terms if not math.isfinite(term.value))
     values = tuple((term.name, term.value) for term in terms.terms)
-    return TrainingDiverged(Divergence(step, view, values, bad, _bad_surfels(method)))
+    return TrainingDiverged(Divergence(step, view, values, bad, _bad_surfels(method), cause))
 
 
 def _bad_surfels(method: Method) -> tuple[BadSurfels, ...]:

@@ -19,7 +19,6 @@ import rtgs
 from rtgs.methods.base import Decision, LossTerm, Method, RenderOptions, Stage
 from rtgs.native import core
 from rtgs.scenes.scene import Scene
-from rtgs.train.adam import NonFiniteGradientError
 from rtgs.train.checkpoint import (
     Checkpoint,
     CheckpointRecord,
@@ -171,8 +170,8 @@ class Trainer:
         terms.total.backward()
         try:
             events = self.method.after_step(step)
-        except NonFiniteGradientError as error:
-            raise diverged(terms, self.method, step, view.name) from error
+        except FloatingPointError as error:  # of Adam or of density control
+            raise diverged(terms, self.method, step, view.name, cause=str(error)) from error
         for event in events:
             self.progress.note(f"step {step + 1}: {event.set_name}: {event.detail}")
         self._averages.add_loss(loss)
