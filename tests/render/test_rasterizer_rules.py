@@ -172,6 +172,19 @@ def test_the_number_of_threads_does_not_change_a_bit(isa: str):
         assert torch.equal(other.weight_sum, runs[0].weight_sum)
 
 
+def test_the_order_of_rows_does_not_change_a_bit(isa: str):
+    """Without ties in depth a pixel adds up the same numbers in the same order."""
+    answered = expected(Recipe("crowded", 7, 150, 49, 35, 12))
+    order = torch.randperm(150, generator=torch.Generator().manual_seed(2))
+    straight = run(rasterize_surfels, answered.scene, torch.float32, answered.upstream)
+    shuffled_scene = replace(answered.scene, surfels=answered.scene.surfels.rows(order))
+    shuffled = run(rasterize_surfels, shuffled_scene, torch.float32, answered.upstream)
+    for name, picture in straight.pictures.items():
+        assert torch.equal(shuffled.pictures[name], picture), name
+    for name, gradient in straight.gradients.items():
+        assert torch.equal(shuffled.gradients[name], gradient[order]), name
+
+
 def test_gradients_of_culled_rows_are_zero(isa: str):
     values = SurfelTensors(*(t.float() for t in RULES["nan mean"].all())).leaves(torch.float32)
     rasterize_surfels(*values.all(), identity_camera()).features.sum().backward()
