@@ -80,7 +80,7 @@ class LineProgress:
 class BarProgress:
     """A bar with remaining time, loss, PSNR, surfel count and speed, on a terminal."""
 
-    def __init__(self) -> None:
+    def __init__(self, stream: TextIO | None = None) -> None:
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -90,7 +90,7 @@ class BarProgress:
             MofNCompleteColumn(),
             TimeRemainingColumn(),
             TextColumn("{task.fields[status]}"),
-            console=Console(stderr=True),
+            console=Console(file=stream or sys.stderr),
             refresh_per_second=4,
         )
         self._task = None
@@ -118,7 +118,7 @@ class BarProgress:
 def progress_for(stream: TextIO | None = None) -> Progress:
     """A bar where ``stream`` (default: standard error) is a terminal, lines elsewhere."""
     shown: TextIO = stream or sys.stderr
-    return BarProgress() if shown.isatty() else LineProgress(shown)
+    return BarProgress(shown) if shown.isatty() else LineProgress(shown)
 
 
 def _clock(seconds: float) -> str:

@@ -1,0 +1,40 @@
+"""What the user sees: a bar on a terminal, lines elsewhere."""
+
+from __future__ import annotations
+
+import io
+
+from rtgs.train.progress import BarProgress, LineProgress, StepReport, progress_for
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_terminal_gets_a_bar_and_a_file_gets_lines():
+    assert isinstance(progress_for(Terminal()), BarProgress)
+    assert isinstance(progress_for(io.StringIO()), LineProgress)
+
+
+def test_the_bar_shows_numbers_and_notes():
+    stream = Terminal()
+    bar = BarProgress(stream)
+    bar.start("diffuse", 0, 100)
+    bar.note("no mono loss: [no] normals")
+    bar.advance(StepReport(100, 0.125, 27.5, 12_345))
+    bar.close()
+    shown = stream.getvalue()
+    for part in ("diffuse", "100/100", "loss 0.1250", "PSNR 27.50 dB", "12,345 surfels", "steps/s", "[no] normals"):
+        assert part in shown
+
+
+def test_lines_come_at_most_every_few_seconds_and_at_the_end():
+    stream = io.StringIO()
+    lines = LineProgress(stream, seconds=1000)
+    lines.start("diffuse", 0, 3)
+    for step in (1, 2, 3):
+        lines.advance(StepReport(step, 0.5, 10.0, 7))
+    lines.close()
+    assert len(stream.getvalue().splitlines()) == 1
+    assert stream.getvalue().startswith("diffuse: step 3/3  loss 0.5000  PSNR 10.00 dB  7 surfels")
