@@ -7,6 +7,7 @@ import os
 import sys
 import traceback
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
@@ -231,10 +232,27 @@ def dashboard(words: list[str]) -> int:
         raise RtgsError(f"{database} does not exist yet: `rtgs run` (with tracking=mlflow) makes it")
     import subprocess
 
-    environment = os.environ | {"MLFLOW_DISABLE_TELEMETRY": "true", "DO_NOT_TRACK": "true"}
+    environment = os.environ | {
+        "MLFLOW_DISABLE_TELEMETRY": "true",
+        "DO_NOT_TRACK": "true",
+        "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false",
+    }
     print(f"http://127.0.0.1:{options.port}  (experiments rtgs/runs and rtgs/steps; Ctrl-C ends it)", flush=True)
-    server = [sys.executable, "-m", "mlflow", "ui", "--host", "127.0.0.1", "--port", str(options.port)]
-    return subprocess.run([*server, "--backend-store-uri", f"sqlite:///{database}"], env=environment).returncode
+    server = [
+        sys.executable,
+        "-m",
+        "mlflow",
+        "ui",
+        "--workers",
+        "1",
+        "--host",
+        "127.0.0.1",
+        "--port",
+        str(options.port),
+    ]
+    with suppress(KeyboardInterrupt):
+        return subprocess.run([*server, "--backend-store-uri", f"sqlite:///{database}"], env=environment).returncode
+    return 0
 
 
 def _root() -> Path:
