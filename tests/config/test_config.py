@@ -48,7 +48,7 @@ def test_defaults_are_the_schema_and_the_chosen_files():
     config, choices = compose([])
     assert (choices.method, choices.preset, choices.ablation) == ("rtgs", "quick", "none")
     assert config.name == "glass_demo-rtgs-quick"
-    assert config.scene.path == str(locate.project_root() / "data" / "glass_demo")
+    assert config.scene.path == "embedded:glass_demo"
     assert Path(config.paths.root).is_absolute()
     assert isinstance(config.scene.background, tuple)
 
