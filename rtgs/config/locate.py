@@ -32,10 +32,3 @@ def choices_of(group: str) -> tuple[str, ...]:
     """Names that can be chosen from a config group."""
     folder = conf_dir() / group
     return tuple(sorted(path.relative_to(folder).with_suffix("").as_posix() for path in folder.rglob("*.yaml")))
-
-
-def register_resolvers() -> None:
-    """``${rtgs.root:}`` in YAML: the folder that holds ``conf/`` and the shipped data."""
-    from omegaconf import OmegaConf
-
-    OmegaConf.register_new_resolver("rtgs.root", lambda: str(project_root()), replace=True)

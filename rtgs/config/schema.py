@@ -160,7 +160,4 @@ def register_schema() -> None:
     """Put the schema into Hydra's config store, under the name that ``conf/config.yaml`` lists first."""
     from hydra.core.config_store import ConfigStore
 
-    from rtgs.config.locate import register_resolvers
-
-    register_resolvers()
     ConfigStore.instance().store(name=SCHEMA_NAME, node=open_schema(RunConfig), provider="rtgs")

@@ -11,7 +11,7 @@ import yaml
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
-from rtgs.config import AblationConfig, RunConfig, compose, locate
+from rtgs.config import AblationConfig, RunConfig, compose
 from rtgs.config.build import build
 from rtgs.config.convert import derive_name
 from rtgs.config.explain import explain
