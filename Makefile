@@ -50,8 +50,8 @@ format: setup ## let ruff put things right
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-dashboard: setup ## browse the runs in MLflow on http://127.0.0.1:5000
-	$(BIN)/mlflow ui --host 127.0.0.1 --port 5000 --backend-store-uri sqlite:///mlflow.db
+dashboard: setup ## browse the runs in MLflow on this machine (loopback)
+	$(BIN)/rtgs dashboard
 
 accept-steps: setup ## accept the changed source of pipeline steps (after bumping a version, or when the output is the same)
 	$(BIN)/python -m tests.pipelines.accept_steps
