@@ -52,13 +52,14 @@ class Rasterization {
         memory_(RasterMemoryPool::instance().take()) {}
   ~Rasterization() { RasterMemoryPool::instance().give(std::move(memory_)); }
 
-  // Projection, sorting and binning; returns the number of (surfel, tile) entries.
-  int64_t project(Floats means, Floats tangent_u, Floats tangent_v, Floats scales, Floats opacities, Floats features,
-                  int threads) {
+  // Projection, sorting and binning.
+  void project(Floats means, Floats tangent_u, Floats tangent_v, Floats scales, Floats opacities, Floats features,
+               int threads) {
     nb::gil_scoped_release release;
     const SurfelArrays in = surfel_arrays(means, tangent_u, tangent_v, scales, opacities, features);
     RasterMemory& m = *memory_;
     count_ = in.count;
+    threads_ = threads;
     features_ = in.channels;
     surfels_.layout = make_layout();
     surfels_.records = m.records.reserve(count_ * surfels_.layout.record_stride + 64);
@@ -73,26 +74,21 @@ class Rasterization {
     visible_ = RTGS_CALL(isa_, sort_by_depth, surfels_, count_, keys, m.spare_keys.reserve(count_ + 1), scratch, threads);
     tiles_.starts = m.starts.reserve(tiles + 1);
     tiles_.used = m.used.reserve(tiles);
+    tiles_.work = m.work.reserve(tiles);
     entries_ = RTGS_CALL(isa_, count_tiles, camera_, surfels_, keys, visible_, scratch, tiles_.starts, threads);
     tiles_.ids = m.ids.reserve(entries_ + 1);
     tiles_.masks = m.masks.reserve(entries_ + 1);
     RTGS_CALL(isa_, fill_tiles, camera_, surfels_, keys, visible_, scratch, tiles_.ids, threads);
-    slots_ready_ = false;
-    return entries_;
   }
 
   void forward(MaybeFloats background, Floats feature_image, MaybeFloats normal_image, Floats alpha, MaybeFloats depth,
-               MaybeFloats median_depth, MaybeFloats distortion, MaybeFloats weight_sum, int threads) {
+               MaybeFloats median_depth, MaybeFloats distortion, MaybeFloats weight_sum) {
     nb::gil_scoped_release release;
-    ForwardArgs args = forward_args(feature_image, normal_image, depth, distortion, threads);
+    ForwardArgs args = forward_args(feature_image, normal_image, depth, distortion);
     args.background = data_or_null(background);
     args.alpha = alpha.data();
     args.median_depth = data_or_null(median_depth);
-    if (weight_sum) {
-      args.slots = slots();
-      args.entry_weight = memory_->entry_weights.reserve(entries_ + 1);
-      for (int64_t k = 0; k < entries_; ++k) args.entry_weight[k] = 0.f;
-    }
+    if (weight_sum) args.entry_weights = memory_->entry_weights.reserve(entries_ + 1);
     RTGS_CALL(isa_, raster_forward, args);
     if (weight_sum) RTGS_CALL(isa_, sum_entry_weights, args, count_, weight_sum->data());
   }
@@ -103,12 +99,12 @@ class Rasterization {
                 MaybeFloats grad_features, MaybeFloats grad_normal, MaybeFloats grad_alpha, MaybeFloats grad_depth,
                 MaybeFloats grad_median, MaybeFloats grad_distortion, MaybeFloats out_means, MaybeFloats out_tangent_u,
                 MaybeFloats out_tangent_v, MaybeFloats out_scales, MaybeFloats out_opacities, MaybeFloats out_features,
-                MaybeFloats out_probe, int threads) {
+                MaybeFloats out_probe) {
     nb::gil_scoped_release release;
     int poisoned = 0;
     BackwardArgs args{};
     args.poisoned = &poisoned;
-    args.forward = forward_args(feature_image, normal_image, depth, distortion, threads);
+    args.forward = forward_args(feature_image, normal_image, depth, distortion);
     args.grad_features = data_or_null(grad_features);
     args.grad_normal = data_or_null(grad_normal);
     args.grad_alpha = data_or_null(grad_alpha);
@@ -116,21 +112,20 @@ class Rasterization {
     args.grad_median = data_or_null(grad_median);
     args.grad_distortion = data_or_null(grad_distortion);
     const int64_t stride = surfels_.layout.gradient_stride;
-    if (threads > 1) {
-      args.slots = slots();
-      args.rows = memory_->slot_rows.reserve(entries_ * stride + 64);
-      args.filled = memory_->filled.reserve(entries_ + 1);
-      __builtin_memset(args.filled, 0, size_t(entries_));
-    } else {
-      args.rows = memory_->rows.reserve(count_ * stride + 64, true);
+    args.rows = memory_->rows.reserve(count_ * stride + 64, true);
+    args.range_starts = memory_->ranges.reserve(2 * threads_ + 1);
+    args.waiting_counts = args.range_starts + threads_ + 1;
+    if (threads_ > 1) {  // sized for the worst case; little of it is ever touched
+      args.waiting_ids = memory_->waiting_ids.reserve(entries_ + 1);
+      args.waiting_rows = memory_->waiting_rows.reserve(entries_ * stride + 64);
     }
-    RTGS_CALL(isa_, raster_backward, args);
+    RTGS_CALL(isa_, raster_backward, args, count_);
 
     const SurfelGradients out = {data_or_null(out_means),     data_or_null(out_tangent_u), data_or_null(out_tangent_v),
                                  data_or_null(out_scales),    data_or_null(out_opacities), data_or_null(out_features),
                                  data_or_null(out_probe)};
     const SurfelArrays in = surfel_arrays(means, tangent_u, tangent_v, scales, opacities, features);
-    RTGS_CALL(isa_, project_backward, {camera_, in, surfels_, args.rows, args.slots, args.filled, out, !poisoned, threads});
+    RTGS_CALL(isa_, project_backward, {camera_, in, surfels_, args.rows, out, !poisoned, threads_});
   }
 
   int64_t entries() const { return entries_; }
@@ -148,15 +143,8 @@ class Rasterization {
     return layout;
   }
 
-  const int64_t* slots() {
-    int64_t* slots = memory_->slots.reserve(count_ + 1);
-    if (!slots_ready_) RTGS_CALL(isa_, assign_slots, surfels_, count_, slots);
-    slots_ready_ = true;
-    return slots;
-  }
-
   ForwardArgs forward_args(const Floats& feature_image, const MaybeFloats& normal_image, const MaybeFloats& depth,
-                           const MaybeFloats& distortion, int threads) {
+                           const MaybeFloats& distortion) {
     ForwardArgs args{};
     args.camera = camera_;
     args.surfels = surfels_;
@@ -172,15 +160,15 @@ class Rasterization {
     args.moment1 = args.transmittance + 2 * pixels;
     args.moment2 = args.transmittance + 3 * pixels;
     if (depth_) args.median_entry = memory_->median_entries.reserve(pixels);
-    args.threads = threads;
+    args.threads = threads_;
     return args;
   }
 
   Isa isa_;
   RasterCamera camera_;
-  bool normal_, depth_, slots_ready_ = false;
+  bool normal_, depth_;
   int64_t count_ = 0, visible_ = 0, entries_ = 0;
-  int features_ = 0;
+  int features_ = 0, threads_ = 1;
   ProjectedSurfels surfels_{};
   TileLists tiles_{};
   std::unique_ptr<RasterMemory> memory_;
@@ -196,7 +184,7 @@ void bind_raster(nb::module_& m) {
       .def("project", &Rasterization::project)
       .def("forward", &Rasterization::forward, nb::arg("background").none(), nb::arg("feature_image"),
            nb::arg("normal_image").none(), nb::arg("alpha"), nb::arg("depth").none(), nb::arg("median_depth").none(),
-           nb::arg("distortion").none(), nb::arg("weight_sum").none(), nb::arg("threads"))
+           nb::arg("distortion").none(), nb::arg("weight_sum").none())
       .def("backward", &Rasterization::backward, nb::arg("means"), nb::arg("tangent_u"), nb::arg("tangent_v"),
            nb::arg("scales"), nb::arg("opacities"), nb::arg("features"), nb::arg("feature_image"),
            nb::arg("normal_image").none(), nb::arg("depth").none(), nb::arg("distortion").none(),
@@ -204,7 +192,7 @@ void bind_raster(nb::module_& m) {
            nb::arg("grad_depth").none(), nb::arg("grad_median").none(), nb::arg("grad_distortion").none(),
            nb::arg("out_means").none(), nb::arg("out_tangent_u").none(), nb::arg("out_tangent_v").none(),
            nb::arg("out_scales").none(), nb::arg("out_opacities").none(), nb::arg("out_features").none(),
-           nb::arg("out_probe").none(), nb::arg("threads"))
+           nb::arg("out_probe").none())
       .def_prop_ro("entries", &Rasterization::entries, "(surfel, tile) pairs")
       .def_prop_ro("visible", &Rasterization::visible, "surfels whose bound meets the image");
   m.def("release_raster_memory", [] { RasterMemoryPool::instance().clear(); },

@@ -14,21 +14,11 @@ struct Rows {
   }
 };
 
-// The rows of one surfel added up in tile order, as one thread adds them directly.
-void load_row(const ProjectBackwardArgs& args, int64_t id, float* row) {
-  const int64_t stride = args.surfels.layout.gradient_stride;
-  if (!args.slots) {
-    memcpy(row, args.rows + id * stride, stride * sizeof(float));
-    memset(args.rows + id * stride, 0, stride * sizeof(float));  // ready for the next call
-    return;
-  }
-  const int sums = args.surfels.layout.gradient_sums();
-  memset(row, 0, stride * sizeof(float));
-  const int64_t end = args.slots[id] + args.surfels.rects[id].tiles();
-  for (int64_t slot = args.slots[id]; slot < end; ++slot) {
-    if (!args.filled[slot]) continue;
-    const float* from = args.rows + slot * stride;
-    for (int k = 0; k < sums; k += kLanes) store(row + k, load(row + k) + load(from + k));
+// Moves a surfel's row out, and leaves zeros for the next call.
+void take_row(const RecordLayout& layout, float* from, float* row) {
+  for (int k = 0; k < layout.gradient_stride; k += kLanes) {
+    store(row + k, load(from + k));
+    store(from + k, broadcast(0.f));
   }
 }
 
@@ -128,7 +118,7 @@ void project_backward(const ProjectBackwardArgs& args) {
     for (int lane = 0; lane < kLanes; ++lane) {
       visible[lane] = lane < lanes && args.surfels.rects[first + lane].tiles() > 0;
       float* row = rows.staged[lane];
-      if (visible[lane]) load_row(args, first + lane, row);
+      if (visible[lane]) take_row(layout, args.rows + (first + lane) * layout.gradient_stride, row);
       else memset(row, 0, layout.gradient_stride * sizeof(float));
       if (args.saturate)
         for (int k = 0; k < layout.gradient_stride; k += kLanes) store(row + k, saturated(load(row + k)));

@@ -73,11 +73,12 @@ struct DepthKey {
   uint32_t depth, id;
 };
 
-struct TileLists {
+struct TileLists {  // an entry is one (surfel, tile) pair
   int64_t* starts;   // (tiles + 1) first entry of each tile
   int32_t* ids;      // surfel of each entry, front to back
   uint64_t* masks;   // blocks of the tile where the surfel shows, written by the forward pass
   int64_t* used;     // (tiles) entries read before every pixel of the tile had stopped
+  int64_t* work;     // (tiles) a measure of the backward pass's work
 };
 
 struct ForwardArgs {
@@ -91,8 +92,7 @@ struct ForwardArgs {
   // optional, null when not asked for:
   float *depth, *median_depth, *distortion, *first_inverse, *moment1, *moment2;  // (H, W)
   int32_t* median_entry;                                         // (H, W) entry within the tile, -1 where none
-  float* entry_weight;      // one slot per (surfel, tile), see slot_of
-  const int64_t* slots;     // (N) first slot of each surfel
+  float* entry_weights;     // (entries) sum of w
   int threads;
   float* plane(int channel) const {
     return channel < features ? feature_image + channel * camera.pixels()
@@ -104,9 +104,14 @@ struct BackwardArgs {
   ForwardArgs forward;
   // upstream gradients; null: none
   const float *grad_features, *grad_normal, *grad_alpha, *grad_depth, *grad_median, *grad_distortion;
-  float* rows;              // gradient rows: one per surfel (slots null), or one per (surfel, tile)
-  const int64_t* slots;     // (N) first row of each surfel
-  uint8_t* filled;          // with slots: rows that were written
+  float* rows;              // one gradient row per surfel, zero before the call
+  // Several threads: thread k takes the tiles from range_starts[k] to range_starts[k + 1]. A surfel's row belongs to
+  // the range of its first tile; what later ranges have for it waits in the order of tiles and is added at the end.
+  // So every row is summed in the order of tiles, whatever the number of threads.
+  int64_t* range_starts;    // (threads + 1)
+  int64_t* waiting_counts;  // (threads)
+  int32_t* waiting_ids;     // (entries); those of range k from tiles.starts[range_starts[k]] on
+  float* waiting_rows;      // likewise
   int* poisoned;            // set to 1 when an upstream gradient is NaN or infinite
   const float* upstream(int channel) const {
     const int feature_count = forward.features;
@@ -123,19 +128,11 @@ struct ProjectBackwardArgs {
   RasterCamera camera;
   SurfelArrays inputs;
   ProjectedSurfels surfels;
-  float* rows;
-  const int64_t* slots;
-  const uint8_t* filled;
+  float* rows;  // zero again after the call
   SurfelGradients out;
   bool saturate;  // a gradient that overflows becomes the largest float; off, so that NaN passes, when upstream holds one
   int threads;
 };
-
-// Row of (surfel, tile) when every pair has its own.
-inline int64_t slot_of(const int64_t* slots, const TileRect* rects, int32_t id, int tile_x, int tile_y) {
-  const TileRect r = rects[id];
-  return slots[id] + int64_t(tile_y - r.y0) * (r.x1 - r.x0 + 1) + (tile_x - r.x0);
-}
 
 #define RTGS_RASTER_KERNELS(isa)                                                                                       \
   namespace isa {                                                                                                      \
@@ -148,10 +145,9 @@ inline int64_t slot_of(const int64_t* slots, const TileRect* rects, int32_t id, 
                       int64_t* cursors, int64_t* starts, int threads);                                                 \
   void fill_tiles(const RasterCamera&, const ProjectedSurfels&, const DepthKey* order, int64_t visible,                \
                   int64_t* cursors, int32_t* ids, int threads);                                                        \
-  int64_t assign_slots(const ProjectedSurfels&, int64_t count, int64_t* slots);                                        \
   void raster_forward(const ForwardArgs&);                                                                             \
   void sum_entry_weights(const ForwardArgs&, int64_t count, float* weight_sum);                                        \
-  void raster_backward(const BackwardArgs&);                                                                           \
+  void raster_backward(const BackwardArgs&, int64_t count);                                                            \
   void project_backward(const ProjectBackwardArgs&);                                                                   \
   }
 RTGS_RASTER_KERNELS(portable)

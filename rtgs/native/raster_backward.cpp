@@ -45,6 +45,18 @@ inline DepthGradients depth_gradients(const ExtraFlags& flags, const BlockExtraG
   return out;
 }
 
+struct Range {  // of tiles, that one thread takes
+  int first_tile;
+  int64_t waiting;  // where the next row that must wait goes
+};
+
+// Does the surfel's row belong to an earlier range?
+inline bool before_range(const ForwardArgs& forward, int64_t id, int first_tile) {
+  if (first_tile == 0) return false;
+  const TileRect rect = forward.surfels.rects[id];
+  return int64_t(rect.y0) * forward.camera.tiles_x() + rect.x0 < first_tile;
+}
+
 template <int C, bool kExtras>
 struct TileBackward {
   static constexpr int kSums = kGradChannels + C + (kExtras ? 2 : 0);
@@ -53,7 +65,7 @@ struct TileBackward {
   BlockExtraGradients extras[kExtras ? kBlocks : 1];
 
   void load_state(const BackwardArgs& args, const Tile& tile);
-  void run(const BackwardArgs& args, const Tile& tile);
+  void run(const BackwardArgs& args, const Tile& tile, Range& range);
 };
 
 template <int C, bool kExtras>
@@ -160,7 +172,7 @@ inline __attribute__((always_inline)) void add_block(const ExtraFlags& flags, co
 }
 
 template <int C, bool kExtras>
-void TileBackward<C, kExtras>::run(const BackwardArgs& args, const Tile& tile) {
+void TileBackward<C, kExtras>::run(const BackwardArgs& args, const Tile& tile, Range& range) {
   constexpr int kFloats = kChannels + C + (kExtras ? kDepthFields : 0);
   const ForwardArgs& forward = args.forward;
   const LaneOffsets offsets;
@@ -174,7 +186,7 @@ void TileBackward<C, kExtras>::run(const BackwardArgs& args, const Tile& tile) {
     if (entry + kPrefetchDistance < count) {
       const int64_t ahead = ids[entry + kPrefetchDistance];
       prefetch_row<kFloats>(records + layout.record_stride * ahead);
-      if (!args.slots) prefetch_row<kPaddedSums, 1>(args.rows + layout.gradient_stride * ahead);
+      prefetch_row<kPaddedSums, 1>(args.rows + layout.gradient_stride * ahead);
     }
     uint64_t remaining = masks[entry];
     if (!remaining) continue;
@@ -189,32 +201,71 @@ void TileBackward<C, kExtras>::run(const BackwardArgs& args, const Tile& tile) {
       add_block<C, kExtras>(flags, record, int(entry), offsets.x + (tile.x + block_x(block)),
                             offsets.y + (tile.y + block_y(block)), blocks[block], extras[kExtras ? block : 0], sums);
     }
-    const int64_t row_index =
-        args.slots ? slot_of(args.slots, forward.surfels.rects, int32_t(id), tile.tile_x, tile.tile_y) : id;
-    float* row = args.rows + layout.gradient_stride * row_index;
-    if (args.slots) args.filled[row_index] = 1;
+    float* row = args.rows + layout.gradient_stride * id;
+    const bool waits = before_range(forward, id, range.first_tile);
+    if (waits) {
+      args.waiting_ids[range.waiting] = int32_t(id);
+      row = args.waiting_rows + layout.gradient_stride * range.waiting++;
+    }
 #pragma GCC unroll 16
     for (int k = 0; k < kPaddedSums; k += kLanes) {
-      const vfloat total = sums_of<>(sums + k);
-      store(row + k, args.slots ? total : load(row + k) + total);
+      const vfloat total = settled(sums_of<>(sums + k));
+      store(row + k, waits ? total : load(row + k) + total);
     }
   }
 }
 
+// Ranges of about equal work: range_starts.
+void split_work(const BackwardArgs& args) {
+  const TileLists& lists = args.forward.tiles;
+  const int tiles = args.forward.camera.tiles_x() * args.forward.camera.tiles_y(), threads = args.forward.threads;
+  int64_t total = 0, done = 0;
+  for (int tile = 0; tile < tiles; ++tile) total += lists.work[tile];
+  int range = 0;
+  for (int tile = 0; tile < tiles; ++tile) {
+    while (range < threads && done * threads >= total * range) args.range_starts[range++] = tile;
+    done += lists.work[tile];
+  }
+  while (range <= threads) args.range_starts[range++] = tiles;
+}
+
 template <int C, bool kExtras>
 void backward_tiles(const BackwardArgs& args) {
-  const int tiles = args.forward.camera.tiles_x() * args.forward.camera.tiles_y(), threads = args.forward.threads;
-#pragma omp parallel num_threads(threads) if (threads > 1)
-  {
+  const int threads = args.forward.threads;
+  split_work(args);
+#pragma omp parallel for num_threads(threads) schedule(static, 1) if (threads > 1)
+  for (int part = 0; part < threads; ++part) {
     alignas(64) TileBackward<C, kExtras> state;
-    if constexpr (kExtras)
-      memset(static_cast<void*>(state.extras), 0, sizeof state.extras);
-#pragma omp for schedule(dynamic, 4)
-    for (int index = 0; index < tiles; ++index) {
+    if (kExtras) memset(static_cast<void*>(state.extras), 0, sizeof state.extras);
+    const int begin = int(args.range_starts[part]), end = int(args.range_starts[part + 1]);
+    const int64_t first_waiting = args.forward.tiles.starts[begin];
+    Range range = {begin, first_waiting};
+    for (int index = begin; index < end; ++index) {
       if (!args.forward.tiles.used[index]) continue;
       const Tile tile(args.forward.camera, index);
       state.load_state(args, tile);
-      state.run(args, tile);
+      state.run(args, tile, range);
+    }
+    args.waiting_counts[part] = range.waiting - first_waiting;
+  }
+}
+
+// Each thread takes a share of the surfels, so that the order of additions to a row is that of the tiles.
+void add_waiting(const BackwardArgs& args, int64_t count) {
+  const int threads = args.forward.threads;
+  const RecordLayout& layout = args.forward.surfels.layout;
+#pragma omp parallel for num_threads(threads) schedule(static, 1)
+  for (int part = 0; part < threads; ++part) {
+    const int64_t begin = count * part / threads, end = count * (part + 1) / threads;
+    for (int range = 1; range < threads; ++range) {
+      const int64_t first = args.forward.tiles.starts[args.range_starts[range]];
+      for (int64_t k = first; k < first + args.waiting_counts[range]; ++k) {
+        const int64_t id = args.waiting_ids[k];
+        if (id < begin || id >= end) continue;
+        const float* from = args.waiting_rows + layout.gradient_stride * k;
+        float* row = args.rows + layout.gradient_stride * id;
+        for (int j = 0; j < layout.gradient_sums(); j += kLanes) store(row + j, load(row + j) + load(from + j));
+      }
     }
   }
 }
@@ -229,8 +280,9 @@ struct Backward {
 
 }  // namespace
 
-void raster_backward(const BackwardArgs& args) {
+void raster_backward(const BackwardArgs& args, int64_t count) {
   for_channels<Backward>(args.forward.surfels.layout.padded_channels, args);
+  if (args.forward.threads > 1) add_waiting(args, count);
 }
 
 }  // namespace rtgs::RTGS_ISA

@@ -119,14 +119,4 @@ void fill_tiles(const RasterCamera& camera, const ProjectedSurfels& surfels, con
   }
 }
 
-// Numbers every (surfel, tile) pair, surfel by surfel; returns their count.
-int64_t assign_slots(const ProjectedSurfels& surfels, int64_t count, int64_t* slots) {
-  int64_t next = 0;
-  for (int64_t id = 0; id < count; ++id) {
-    slots[id] = next;
-    next += surfels.rects[id].tiles();
-  }
-  return next;
-}
-
 }  // namespace rtgs::RTGS_ISA

@@ -32,7 +32,7 @@ struct ExtraFlags {
   bool any_depth() const { return depth || median || distortion; }
   explicit ExtraFlags(const ForwardArgs& a)
       : depth(a.depth != nullptr), median(a.median_depth != nullptr), distortion(a.distortion != nullptr),
-        weight(a.entry_weight != nullptr),
+        weight(a.entry_weights != nullptr),
         depth_scale(a.camera.far * a.camera.near / (a.camera.far - a.camera.near)) {}
 };
 
@@ -92,7 +92,7 @@ void TileForward<C, kExtras>::composite(const ForwardArgs& args, const Tile& til
   uint64_t* masks = args.tiles.masks + start;
   const float* records = args.surfels.records;
   const int64_t stride = args.surfels.layout.record_stride;
-  int64_t entry = 0;
+  int64_t entry = 0, work = 0;
   for (; entry < count && live; ++entry) {
     if (entry + kPrefetchDistance < count) prefetch_row<kFloats>(records + stride * ids[entry + kPrefetchDistance]);
     const float* record = records + stride * ids[entry];
@@ -119,10 +119,13 @@ void TileForward<C, kExtras>::composite(const ForwardArgs& args, const Tile& til
       if (!any(ge(after, broadcast(kMinTransmittance)))) live &= ~(uint64_t(1) << block);
     }
     masks[entry] = shown_blocks;
-    if (kExtras && flags.weight && shown_blocks)
-      args.entry_weight[slot_of(args.slots, args.surfels.rects, ids[entry], tile.tile_x, tile.tile_y)] = sum(weight);
+    if (kExtras && flags.weight) args.entry_weights[start + entry] = sum(weight);
+    work += shown_blocks ? 3 + 2 * __builtin_popcountll(shown_blocks) : 0;
   }
   args.tiles.used[tile.index] = entry;
+  args.tiles.work[tile.index] = work + 4 * kBlocks;
+  if (args.entry_weights)
+    for (; entry < count; ++entry) args.entry_weights[start + entry] = 0.f;
 }
 
 template <int C, bool kExtras>
@@ -174,7 +177,7 @@ void forward_tiles(const ForwardArgs& args) {
 template <int C>
 struct Forward {
   static void run(const ForwardArgs& args) {
-    if (args.depth || args.median_depth || args.distortion || args.entry_weight) forward_tiles<C, true>(args);
+    if (args.depth || args.median_depth || args.distortion || args.entry_weights) forward_tiles<C, true>(args);
     else forward_tiles<C, false>(args);
   }
 };
@@ -183,13 +186,17 @@ struct Forward {
 
 void raster_forward(const ForwardArgs& args) { for_channels<Forward>(args.surfels.layout.padded_channels, args); }
 
+// Adds in the order of entries, each thread for its share of the surfels.
 void sum_entry_weights(const ForwardArgs& args, int64_t count, float* weight_sum) {
-#pragma omp parallel for num_threads(args.threads) schedule(static) if (args.threads > 1)
-  for (int64_t id = 0; id < count; ++id) {
-    const int64_t tiles = args.surfels.rects[id].tiles();
-    float total = 0.f;
-    for (int64_t k = 0; k < tiles; ++k) total += args.entry_weight[args.slots[id] + k];
-    weight_sum[id] = total;
+  const int64_t tiles = int64_t(args.camera.tiles_x()) * args.camera.tiles_y(), entries = args.tiles.starts[tiles];
+#pragma omp parallel for num_threads(args.threads) schedule(static, 1) if (args.threads > 1)
+  for (int part = 0; part < args.threads; ++part) {
+    const int64_t begin = count * part / args.threads, end = count * (part + 1) / args.threads;
+    memset(weight_sum + begin, 0, size_t(end - begin) * sizeof(float));
+    for (int64_t entry = 0; entry < entries; ++entry) {
+      const int32_t id = args.tiles.ids[entry];
+      if (id >= begin && id < end) weight_sum[id] += args.entry_weights[entry];
+    }
   }
 }
 

@@ -49,13 +49,12 @@ class Buffer {
 
 struct RasterMemory {
   Buffer<float> records, depths, images, entry_weights;
-  Buffer<float> rows;       // one gradient row per surfel; all zero between calls
-  Buffer<float> slot_rows;  // one per (surfel, tile), when several threads run
-  Buffer<uint8_t> filled;
+  Buffer<float> rows;  // one gradient row per surfel; all zero between calls
+  Buffer<float> waiting_rows;
   Buffer<TileRect> rects;
   Buffer<DepthKey> keys, spare_keys;
-  Buffer<int64_t> scratch, starts, used, slots;
-  Buffer<int32_t> ids, median_entries;
+  Buffer<int64_t> scratch, starts, used, work, ranges;
+  Buffer<int32_t> ids, waiting_ids, median_entries;
   Buffer<uint64_t> masks;
 };
 

@@ -250,4 +250,18 @@ static inline float sum(vfloat a) {
   return total;
 }
 
+// The value as computed: fast-math may not regroup the additions behind it with those of what it is added to next.
+static inline vfloat settled(vfloat a) {
+#if defined(__AVX2__)
+  asm("" : "+v"(a));
+#else
+  asm("" : "+m"(a));
+#endif
+  return a;
+}
+static inline float settled(float a) {
+  asm("" : "+m"(a));
+  return a;
+}
+
 }  // namespace rtgs::RTGS_ISA

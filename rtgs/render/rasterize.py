@@ -1,4 +1,4 @@
-"""The surfel rasteriser on the native core (docs/rasterizer.md says what it computes, kernels in rtgs/native/raster*)."""
+"""The surfel rasteriser on the native core: docs/rasterizer.md says what it computes, rtgs/native/raster* how."""
 
 from __future__ import annotations
 
@@ -123,10 +123,9 @@ class _Rasterize(torch.autograd.Function):
             _array(median_depth),
             _array(distortion),
             _array(weight_sum),
-            call.threads,
         )
         if any(ctx.needs_input_grad):
-            ctx.native, ctx.threads = native, call.threads
+            ctx.native = native
             ctx.save_for_backward(
                 means, tangent_u, tangent_v, scales, opacities, features, image, normal, depth, distortion
             )
@@ -154,7 +153,6 @@ class _Rasterize(torch.autograd.Function):
             _array(distortion),
             *(None if g is None else _array(g.contiguous()) for g in upstream),
             *(_array(g) for g in gradients),
-            ctx.threads,
         )
         return (*gradients, None)
 
