@@ -8,8 +8,7 @@ all optional outputs on over the prototype's, which has none of them; ``cost_of_
 without. ``speedup_2_threads``: CPU time of forward + backward at one thread over the largest CPU time of a thread at
 two (100,000 surfels), each the lowest of all rounds; ``wall_speedup_2_threads`` is the same by the clock on the wall.
 
-Without the prototype (``RTGS_SHARED``, default ``../shared``) or a compiler its ratios are null. The last line is a JSON
-object.
+Without the prototype (``RTGS_SHARED``, default ``../shared``) or a compiler its ratios are null. The last line is JSON.
 """
 
 from __future__ import annotations
