@@ -10,9 +10,30 @@ struct ScreenBound {
   vfloat centre_x, centre_y, slope_y, slope_x, inv_x2, inv_y2_given_x, inv_y2, inv_x2_given_y, disc2;
 };
 
+// Bound of a circle that meets the camera plane, where only what lies beyond `near` shows: a rectangle of the plane,
+// one side along the steepest change of z, holds that part; the box of its four projected corners holds the picture.
+void bound_cut_circle(const RasterCamera& camera, const SurfelGeometry& g, vfloat reach, vmask cut, ScreenBound& s) {
+  const vfloat slope = max(sqrt(g.a.z * g.a.z + g.b.z * g.b.z), broadcast(1e-30f));
+  const vfloat cosine = g.a.z / slope, sine = g.b.z / slope, radius = sqrt(reach) * 1.001f;
+  const vec3 steep = cosine * g.a + sine * g.b, level = cosine * g.b + (-sine) * g.a;
+  const vfloat nearest = max(-radius, (camera.near * 0.999f - g.p.z) / slope);
+  const vfloat ends[] = {nearest, radius}, sides[] = {-radius, radius};
+  for (const vfloat along : ends)
+    for (const vfloat across : sides) {
+      const vec3 corner = g.p + along * steep + across * level;
+      const vfloat z = max(corner.z, broadcast(camera.near * 0.99f));
+      const vfloat x = camera.fx * corner.x / z + camera.cx, y = camera.fy * corner.y / z + camera.cy;
+      const vfloat slack_x = abs(x) * 1e-3f + 0.1f, slack_y = abs(y) * 1e-3f + 0.1f;
+      s.left = select(cut, min(s.left, x - slack_x), s.left);
+      s.right = select(cut, max(s.right, x + slack_x), s.right);
+      s.top = select(cut, min(s.top, y - slack_y), s.top);
+      s.bottom = select(cut, max(s.bottom, y + slack_y), s.bottom);
+    }
+}
+
 // The circle u^2 + v^2 <= reach maps to an ellipse while it stays in front of the camera plane; its dual conic needs
 // no inverse of A. Squared half-widths grow a little so that rounding never loses a pixel. Circles that meet the
-// camera plane have no ellipse: the bound is the whole screen and every block passes the test.
+// camera plane have no ellipse: they get a box, in which every block passes the test.
 ScreenBound screen_bound(const RasterCamera& camera, const SurfelGeometry& g, vfloat reach) {
   ScreenBound s;
   vfloat sx = camera.fx * g.inverse_z * g.inverse_z, sy = camera.fy * g.inverse_z * g.inverse_z;
@@ -37,11 +58,11 @@ ScreenBound screen_bound(const RasterCamera& camera, const SurfelGeometry& g, vf
   s.inv_x2_given_y = where(bounded, 1.f / ((area / wide_y) * 1.0001f + (1e-4f + 1e-10f * xx)));
   s.disc2 = reach * 0.50005f + 1e-4f;
   vfloat half_x = sqrt(wide_x), half_y = sqrt(wide_y), disc = sqrt(s.disc2);
-  const vfloat far_away = broadcast(1e9f);
-  s.left = select(bounded, g.mean_x + min(x - half_x, -disc), -far_away);
-  s.right = select(bounded, g.mean_x + max(x + half_x, disc), far_away);
-  s.top = select(bounded, g.mean_y + min(y - half_y, -disc), -far_away);
-  s.bottom = select(bounded, g.mean_y + max(y + half_y, disc), far_away);
+  s.left = g.mean_x + select(bounded, min(x - half_x, -disc), -disc);
+  s.right = g.mean_x + select(bounded, max(x + half_x, disc), disc);
+  s.top = g.mean_y + select(bounded, min(y - half_y, -disc), -disc);
+  s.bottom = g.mean_y + select(bounded, max(y + half_y, disc), disc);
+  if (any(mask_not(bounded))) bound_cut_circle(camera, g, reach, mask_not(bounded), s);
   return s;
 }
 

@@ -36,7 +36,7 @@ inline DepthGradients depth_gradients(const ExtraFlags& flags, const BlockExtraG
     out.to_depth = w * g.depth;
   }
   if (flags.distortion) {
-    const vfloat inverse_z = 1.f / z, m = flags.depth_scale * (g.first_inverse - inverse_z);
+    const vfloat inverse_z = reciprocal(z), m = flags.depth_scale * (g.first_inverse - inverse_z);
     out.to_weight += g.distortion * (m * (m * g.total - 2.f * g.moment1) + g.moment2);
     const vfloat to_m = 2.f * w * g.distortion * (m * g.total - g.moment1);
     out.to_depth += to_m * (flags.depth_scale * inverse_z * inverse_z);

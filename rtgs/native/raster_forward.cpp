@@ -47,7 +47,7 @@ inline void add_extras(const ExtraFlags& flags, const Response& r, const float* 
   }
   if (flags.distortion) {
     // Only differences of m count: take the first contribution's from all, or the sums cancel.
-    const vfloat inverse_z = 1.f / z;
+    const vfloat inverse_z = reciprocal(z);
     extras.first_inverse = select(shown & ge(broadcast(0.f), extras.first_inverse), inverse_z, extras.first_inverse);
     const vfloat m = flags.depth_scale * (extras.first_inverse - inverse_z), wm = w * m;
     extras.distortion += w * (m * m * (1.f - transmittance) + extras.moment2 - 2.f * m * extras.moment1);
@@ -119,7 +119,7 @@ void TileForward<C, kExtras>::composite(const ForwardArgs& args, const Tile& til
       if (!any(ge(after, broadcast(kMinTransmittance)))) live &= ~(uint64_t(1) << block);
     }
     masks[entry] = shown_blocks;
-    if (kExtras && flags.weight) args.entry_weights[start + entry] = sum(weight);
+    if (kExtras && flags.weight) args.entry_weights[start + entry] = shown_blocks ? sum(weight) : 0.f;
     work += shown_blocks ? 3 + 2 * __builtin_popcountll(shown_blocks) : 0;
   }
   args.tiles.used[tile.index] = entry;

@@ -244,10 +244,16 @@ static inline vfloat sums_of(const vfloat* v) {
   if constexpr (S == 1) return half[0];
   else return sums_of<S / 2>(half);
 }
-static inline float sum(vfloat a) {
-  float total = 0.f;
-  for (int lane = 0; lane < kLanes; ++lane) total += a[lane];
-  return total;
+static inline float sum(vfloat a) {  // by halves
+#if defined(__AVX512F__)
+  return _mm512_reduce_add_ps((__m512)a);
+#elif defined(__AVX2__)
+  __m128 q = _mm_add_ps(_mm256_castps256_ps128((__m256)a), _mm256_extractf128_ps((__m256)a, 1));
+  q = _mm_add_ps(q, _mm_movehl_ps(q, q));
+  return _mm_cvtss_f32(_mm_add_ss(q, _mm_movehdup_ps(q)));
+#else
+  return (a[0] + a[2]) + (a[1] + a[3]);
+#endif
 }
 
 // The value as computed: fast-math may not regroup the additions behind it with those of what it is added to next.

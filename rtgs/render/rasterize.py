@@ -47,17 +47,7 @@ def rasterize_surfels(
     Raises:
         ValueError: a shape, a dtype or an option does not fit; the message names the argument.
     """
-    tensors = {
-        "means": means,
-        "tangent_u": tangent_u,
-        "tangent_v": tangent_v,
-        "scales": scales,
-        "opacities": opacities,
-        "features": features,
-        "background": background,
-        "screen_probe": screen_probe,
-    }
-    _check_shapes(tensors)
+    _check_tensors(means, tangent_u, tangent_v, scales, opacities, features, background, screen_probe)
     _check_options(options, camera)
     if background is not None:
         background = background.detach().contiguous()
@@ -157,29 +147,35 @@ class _Rasterize(torch.autograd.Function):
         return (*gradients, None)
 
 
-def _check_shapes(tensors: dict[str, Tensor | None]) -> None:
-    features, means = tensors["features"], tensors["means"]
+def _check_tensors(
+    means: Tensor,
+    tangent_u: Tensor,
+    tangent_v: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    background: Tensor | None,
+    screen_probe: Tensor | None,
+) -> None:
     channels = features.shape[1] if features.ndim == 2 else 0
     if not 1 <= channels <= MAX_CHANNELS:
         raise ValueError(f"features must be (N, C) with 1 <= C <= {MAX_CHANNELS}, got {tuple(features.shape)}")
     count = means.shape[0] if means.ndim else 0
     expected = {
-        "means": (count, 3),
-        "tangent_u": (count, 3),
-        "tangent_v": (count, 3),
-        "scales": (count, 2),
-        "opacities": (count,),
-        "features": (count, channels),
-        "background": (channels,),
-        "screen_probe": (count, 2),
+        "means": (means, (count, 3)),
+        "tangent_u": (tangent_u, (count, 3)),
+        "tangent_v": (tangent_v, (count, 3)),
+        "scales": (scales, (count, 2)),
+        "opacities": (opacities, (count,)),
+        "features": (features, (count, channels)),
+        "background": (background, (channels,)),
+        "screen_probe": (screen_probe, (count, 2)),
     }
-    for name, tensor in tensors.items():
+    for name, (tensor, shape) in expected.items():
         if tensor is None:
             continue
-        if tuple(tensor.shape) != expected[name]:
-            raise ValueError(
-                f"{name} must have shape {expected[name]} to fit means and features, got {tuple(tensor.shape)}"
-            )
+        if tuple(tensor.shape) != shape:
+            raise ValueError(f"{name} must have shape {shape} to fit means and features, got {tuple(tensor.shape)}")
         if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
             raise ValueError(
                 f"{name} must be float32 on the CPU, got {tensor.dtype} on {tensor.device}; "
