@@ -86,7 +86,7 @@ class BarProgress:
 
         self._bar = Progress(
             TextColumn("{task.description}"),
-            BarColumn(bar_width=24),
+            BarColumn(bar_width=10),
             MofNCompleteColumn(),
             TimeRemainingColumn(),
             TextColumn("{task.fields[status]}"),
@@ -105,7 +105,7 @@ class BarProgress:
         if self._task is None:
             return
         rate = (report.step - self._first) / max(time.monotonic() - self._began, 1e-9)
-        status = f"loss {report.loss:.4f}  PSNR {report.psnr:.2f} dB  {report.surfels:,} surfels  {rate:.1f} steps/s"
+        status = f"loss {report.loss:.3f}  {report.psnr:.1f} dB  {report.surfels:,} surfels  {rate:.0f}/s"  # 80 columns
         self._bar.update(self._task, completed=report.step, status=status)
 
     def note(self, text: str) -> None:
