@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import logging
 import os
+import sqlite3
 import time
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -93,7 +94,8 @@ class MlflowTracking:
         self.root = root.absolute()
         self.root.mkdir(parents=True, exist_ok=True)
         self.local = not uri
-        self.uri = uri or f"sqlite:///{self.root / 'mlflow.db'}"
+        self.database = self.root / "mlflow.db"
+        self.uri = uri or f"sqlite:///{self.database}"
         self._client: MlflowClient | None = None
 
     @property
@@ -110,15 +112,30 @@ class MlflowTracking:
             _quiet_logs()
             try:
                 with FileLock(str(self.root / "mlflow.db.init.lock")):  # two migrations at once kill each other
+                    if self.local and not self.database.exists():
+                        self._make_database()
                     client = MlflowClient(tracking_uri=self.uri)
                     client.search_experiments(max_results=1)
             except Exception as error:  # of MLflow, SQLAlchemy, SQLite, or the network
+                away = f"move {self.database} away, " if self.local else ""
                 raise RtgsError(
                     f"MLflow at {self.uri} does not answer ({type(error).__name__}: {_first_line(error)}); "
-                    "set tracking.uri, or run with tracking=off"
+                    f"{away}set tracking.uri, or run with tracking=off"
                 ) from error
             self._client = client
         return self._client
+
+    def _make_database(self) -> None:
+        """Make the tables beside and rename: a kill in the middle of MLflow's migrations leaves a file it cannot use."""
+        from mlflow.tracking import MlflowClient
+
+        fresh = self.database.with_name("mlflow.db.new")
+        for left in self.root.glob(f"{fresh.name}*"):  # by a process that was killed here
+            left.unlink()
+        MlflowClient(tracking_uri=f"sqlite:///{fresh}").search_experiments(max_results=1)
+        with closing(sqlite3.connect(fresh)) as connection:
+            connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")  # everything into the one file that is renamed
+        os.replace(fresh, self.database)
 
     @contextmanager
     def run(self, info: RunInfo) -> Iterator[Tracker]:

@@ -128,6 +128,22 @@ def test_a_database_that_cannot_be_used_says_so(tmp_path):
         pass
 
 
+def test_a_kill_while_the_database_is_made_leaves_nothing_in_the_way(tmp_path):
+    process = writer(tmp_path, "once")
+    end = time.monotonic() + 60
+    while not any(path.stat().st_size for path in tmp_path.glob("mlflow.db*") if path.suffix != ".lock"):
+        assert process.poll() is None
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    process.kill()
+    process.wait(10)
+    tracking = MlflowTracking(tmp_path)
+    with tracking.run(INFO) as tracker:
+        tracker.metrics({"loss": 2.0})
+    assert runs(tracking, "rtgs/test")[0].data.metrics == {"loss": 2.0}
+    assert not list(tmp_path.glob("mlflow.db.new*"))
+
+
 def test_batches_cost_little(tracking):
     with tracking.run(INFO) as tracker:
         start = time.process_time()
