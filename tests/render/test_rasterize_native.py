@@ -16,17 +16,6 @@ from rtgs.render.rasterize import rasterize_surfels
 from .native_scene import PICTURES, SCENE_OPTIONS, NativeScene, native_scene
 
 
-@pytest.fixture(params=["avx512", "avx2", "portable"])
-def isa(request: pytest.FixtureRequest):
-    """Every instruction set in turn."""
-    if request.param not in core.available_isas():
-        pytest.skip(f"this CPU does not run {request.param}")
-    before = core.isa()
-    core.select_isa(request.param)
-    yield request.param
-    core.select_isa(before)
-
-
 def everything(scene: NativeScene, seed: int = 0) -> list[Tensor]:
     """All pictures, the weight sums and all gradients of a random upstream gradient."""
     generator = torch.Generator().manual_seed(seed)

@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from rtgs.gaussians.surfels import Surfels
-from rtgs.native import core
 from rtgs.train.adam import NonFiniteGradientError, SurfelAdam, find_nonfinite
 from rtgs.train.settings import OptimizerSettings
 
@@ -35,16 +34,6 @@ def draw_gradients(surfels: Surfels, generator: torch.Generator, active: int = 1
         values.grad[: len(values) // 4] = 0
         if name == "sh_rest":
             values.grad[:, active:] = 0
-
-
-@pytest.fixture(params=["portable", "avx2", "avx512"])
-def isa(request):
-    if request.param not in core.available_isas():
-        pytest.skip(f"{request.param} is not compiled in or does not run on this CPU")
-    before = core.isa()
-    core.select_isa(request.param)
-    yield request.param
-    core.select_isa(before)
 
 
 @pytest.mark.parametrize("count", [1, 37, 200])
