@@ -126,7 +126,7 @@ class MlflowTracking:
         return self._client
 
     def _make_database(self) -> None:
-        """Make the tables beside and rename: a kill in the middle of MLflow's migrations leaves a file it cannot use."""
+        """Make the tables beside and rename: a kill amid MLflow's migrations leaves a file that it cannot use."""
         from mlflow.tracking import MlflowClient
 
         fresh = self.database.with_name("mlflow.db.new")
