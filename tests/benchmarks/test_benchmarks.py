@@ -1,0 +1,98 @@
+"""Every benchmark runs in a tiny mode and ends with a JSON object that has the promised keys. No timings are judged."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+from benchmarks import gaussians, losses, raster, speed_error, train_step
+from rtgs.native import core
+
+
+@pytest.fixture(autouse=True)
+def _nothing_shared(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """No prototypes and no captures beside the repository: what a stranger has."""
+    monkeypatch.setenv("RTGS_SHARED", str(tmp_path / "absent"))
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    """Run a benchmark's ``main`` with a command line and return the object on its last line."""
+
+    def last_line(module: ModuleType, *words: str) -> dict[str, Any]:
+        monkeypatch.setattr(sys, "argv", [module.__name__, *words])
+        before = core.isa()
+        module.main()
+        assert core.isa() == before, "a benchmark puts the instruction set back"
+        return json.loads(capsys.readouterr().out.splitlines()[-1])
+
+    return last_line
+
+
+def test_raster(run) -> None:
+    figures = run(raster, "--repeat", "1", "--counts", "20000")
+    for stage in ("project", "forward", "backward", "full"):
+        assert figures[f"ratio_{stage}_20k"] is None, "without the prototype there is nothing to compare with"
+    assert set(figures["ms_20k"]) == {"ours", "full"}
+    assert all(figures[key] > 0 for key in ("cost_of_outputs_20k", "speedup_2_threads", "peak_memory_mb"))
+    assert figures["machine"]["isa"] == core.isa()
+
+
+def test_train_step(run) -> None:
+    figures = run(train_step, "--rounds", "1")
+    parts = ("activate", "raster", "photometric", "normal", "adam", "density")
+    assert figures["step_over_raster"] > 0
+    assert all(figures[f"{part}_ms"] > 0 for part in parts)
+    assert math.isclose(sum(figures[f"share_{part}"] for part in (*parts, "rest")), 1, abs_tol=0.01)
+
+
+def test_losses(run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(losses, "SIZES", ((40, 30),))
+    monkeypatch.setattr(losses, "NATIVE_CALLS", 1)
+    monkeypatch.setattr(losses, "TORCH_CALLS", 1)
+    figures = run(losses)
+    for name in ("photometric", "normal", "normal_depth_weighted", "mono_normal"):
+        assert all(figures[f"{name}_40x30_{kind}"] >= 0 for kind in ("ms", "torch_ms", "ratio"))
+    assert figures["isa"] == core.isa()
+
+
+def test_gaussians(run) -> None:
+    figures = run(gaussians, "--counts", "1000", "--repeat", "2")
+    for isa in core.available_isas():
+        assert figures[f"activate_both_{isa}_1k"] > 0
+    named = ("ratio_activate", "ratio_adam", "adam", "observe", "densify", "write_ply", "read_ply")
+    assert all(figures[f"{name}_1k"] > 0 for name in named)
+
+
+def test_speed_error(run, tmp_path: Path) -> None:
+    kernel = ("--quick", "--surfels", "60", "--width", "32", "--rounds", "2")
+    training = ("--scenes", "demo", "--steps", "2", "3", "--caps", "2000", "--long-side", "32")
+    figures = run(speed_error, *kernel, *training, "--output", str(tmp_path))
+    paths = figures["kernel"]["paths"]
+    assert set(paths) == {*core.available_isas(), "twin_float32", "twin_float64"}
+    assert all(path["ms"] > 0 for path in paths.values())
+    for name in set(paths) - {"twin_float64"}:
+        assert 0 <= paths[name]["share_beyond"] <= 1
+        assert 0 < paths[name]["picture_worst"] < 1e-3
+        assert 0 < paths[name]["gradient_worst"] < 1e-2
+    assert [(point["steps"], point["cap"]) for point in figures["training"]] == [(2, 2000), (3, 2000)]
+    assert all(point["psnr"] > 0 and point["peak_memory_mb"] > 0 for point in figures["training"])
+    assert json.loads((tmp_path / "speed_error.json").read_text(encoding="utf-8")) == figures
+    assert (tmp_path / "speed_error.png").read_bytes().startswith(b"\x89PNG")
+    assert run(speed_error, "--parts", "--keep", "--output", str(tmp_path)) == figures, "drawn again, nothing measured"
+
+
+def test_speed_error_shrinks_the_schedule() -> None:
+    overrides = dict(word.split("=") for word in speed_error.schedule_overrides(500))
+    assert overrides["schedule.total"] == overrides["schedule.means_lr_steps"] == "500"
+    assert 100 <= int(overrides["schedule.densify_from"]) < int(overrides["schedule.densify_until"]) < 500
+
+
+def test_speed_error_sweep_has_each_point_once() -> None:
+    assert sorted(speed_error.sweep([500, 1000], [5, 10])) == [(500, 10), (1000, 5), (1000, 10)]
