@@ -16,8 +16,8 @@ help: ## list the targets
 setup: $(READY) ## make .venv with everything, native core built
 
 $(READY): $(NATIVE)
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
-	  { echo "rtgs needs Python 3.11 or newer; $$($(PYTHON) --version) is '$(PYTHON)'. Try: make PYTHON=python3.11 $(MAKECMDGOALS)"; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || \
+	  { echo "rtgs needs Python 3.11 or newer; '$(PYTHON)' is $$($(PYTHON) --version 2>/dev/null || echo not there). Try: make PYTHON=python3.11 $(MAKECMDGOALS)"; exit 1; }
 	@command -v "$${CXX:-c++}" >/dev/null || \
 	  { echo "rtgs builds a native core and found no C++ compiler ('$${CXX:-c++}'). Install one: Debian/Ubuntu 'apt install g++', Fedora 'dnf install gcc-c++', macOS 'xcode-select --install'; or set CXX."; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)

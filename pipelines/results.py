@@ -135,7 +135,7 @@ def result_table(tables: Sequence[EvaluationTable]) -> str:
                 row.scene,
                 row.method,
                 row.preset,
-                f"{row.views} of {row.resolution}",
+                f"{row.views} of {row.resolution}" if row.views else "none",
                 _figure(row.psnr, "{:.2f} dB"),
                 _figure(row.ssim, "{:.4f}"),
                 _figure(row.lpips_01, "{:.4f}"),
@@ -177,8 +177,10 @@ def track_end(tracker: Tracker, folder: Path, results: Sequence[StepResult]) -> 
             for row in read_history(result.folder):
                 step = int(row.pop("step"))
                 tracker.metrics(row, step)
+    from rtgs.evaluate.evaluate import METRICS
+
     table = evaluation_of(results)
-    means = {name: table.mean(name) for name in table.rows[0].values}
+    means = {name: table.mean(name) for name in METRICS}
     tracker.metrics({f"eval/{name}": value for name, value in means.items() if value is not None})
     facts = {"train_seconds": table.facts.train_seconds, "peak_memory_mb": table.facts.peak_memory_mb}
     tracker.metrics({f"cost/{name}": value for name, value in facts.items() if value is not None})

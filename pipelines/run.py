@@ -101,12 +101,7 @@ def friendly_overrides(arguments: Sequence[str]) -> list[str]:
     for argument in arguments:
         key, _, value = argument.partition("=")
         plain = value.strip("'\"")
-        if (
-            key == "scene"
-            and "," not in value
-            and plain not in choices_of("scene")
-            and Path(plain).expanduser().is_dir()
-        ):
+        if key == "scene" and "," not in value and plain not in choices_of("scene") and _is_path(plain, arguments):
             rewritten += ["scene=capture", f"scene.path={_quoted(plain)}"]
         elif key == "scene.path" and not value.startswith(("'", '"')) and Path(value).expanduser().exists():
             rewritten.append(f"scene.path={_quoted(value)}")
@@ -117,6 +112,12 @@ def friendly_overrides(arguments: Sequence[str]) -> list[str]:
         rewritten.append("scene=capture")
     options = [argument for argument in rewritten if not _is_override(argument)]
     return options + [argument for argument in rewritten if _is_override(argument)]  # argparse wants them in one piece
+
+
+def _is_path(text: str, arguments: Sequence[str]) -> bool:
+    """Whether a scene is a path: it exists, or looks like one (then the importer says that nothing is there)."""
+    own_files = any(argument.startswith(("--config-dir", "-cd")) for argument in arguments)  # may hold scene/group/name
+    return Path(text).expanduser().exists() or (not own_files and (os.sep in text or text.startswith(("~", "."))))
 
 
 def _is_override(argument: str) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import os
 import sys
 import traceback
@@ -64,22 +65,45 @@ def report_error(error: Exception) -> int:
     if os.environ.get("RTGS_DEBUG") or not is_for_users(error):
         traceback.print_exception(error)
     else:
-        from rtgs.config.explain import explain
-
-        print(f"rtgs: {explain(error) if _of_config(error) else error}", file=sys.stderr)
+        print(f"rtgs: {_message(error)}", file=sys.stderr)
     return 1
+
+
+def _message(error: Exception) -> str:
+    from rtgs.config.explain import explain, explain_yaml
+
+    if _package(error) == "yaml":
+        return explain_yaml(error)
+    if _of_config(error):
+        return explain(error)
+    inner = getattr(error, "error", error)
+    if _disk_is_full(inner):
+        return f"{error}; free some space, then the same command goes on where it was"
+    if isinstance(inner, OSError) and inner.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        return f"{error}; make it writable, or choose another folder for store and runs with RTGS_ROOT or paths.root"
+    return str(error)
+
+
+def _disk_is_full(error: BaseException) -> bool:
+    return (isinstance(error, OSError) and error.errno == errno.ENOSPC) or "No space left on device" in str(error)
 
 
 def is_for_users(error: BaseException) -> bool:
     """Whether the message of an error is meant for users: our own types, values our code refused, the disk."""
     inner = getattr(error, "error", error)  # what a step raised
-    if isinstance(inner, (RtgsError, OSError)) or _of_config(inner) or type(inner).__module__.startswith("rtgs."):
+    if isinstance(inner, (RtgsError, OSError)) or _package(inner) in ("rtgs", "hydra", "omegaconf", "yaml"):
+        return True
+    if _disk_is_full(inner):  # safetensors has an exception of its own for it
         return True
     return isinstance(inner, (ValueError, TypeError)) and _raised_in_project(inner.__traceback__)
 
 
 def _of_config(error: BaseException) -> bool:
-    return type(error).__module__.split(".")[0] in ("hydra", "omegaconf")
+    return _package(error) in ("hydra", "omegaconf")
+
+
+def _package(error: BaseException) -> str:
+    return type(error).__module__.split(".")[0]
 
 
 def _raised_in_project(trace: TracebackType | None) -> bool:

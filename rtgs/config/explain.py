@@ -9,6 +9,7 @@ import typing
 
 from hydra.errors import OverrideParseException
 
+from rtgs.config.locate import choices_of
 from rtgs.config.schema import RunConfig
 
 
@@ -25,11 +26,24 @@ def explain(error: BaseException) -> str:
     text = re.sub(r"\nTo append to your config use .*", "", text)
     text = re.sub(r"\n\s*full_key: (\S+)", r" (\1)", text)
     text = re.sub(r"\n\s*full_key: ?", "", text)
+    if match := re.search(r"Could not find '(\w+)/([^']*)'", text):
+        text += _advice_for_choice(*match.groups())
     match = re.search(r"Key '([^']+)' (?:is )?not in", text)
     if match:
         close = difflib.get_close_matches(match.group(1), sorted(all_keys(RunConfig)), n=3)
         text += f"\nDid you mean {' or '.join(close)}?" if close else "\n`rtgs run --help` lists all keys."
     return text
+
+
+def explain_yaml(error: BaseException) -> str:
+    """One message for a file that is no YAML; the parser names file, line and column."""
+    return f"a config file is no valid YAML: {' '.join(str(error).split())}; correct it there"
+
+
+def _advice_for_choice(group: str, name: str) -> str:
+    close = difflib.get_close_matches(name, choices_of(group), n=3)
+    advice = f"\nDid you mean {' or '.join(close)}?" if close else ""
+    return advice + ("\nA folder works as well: scene=/path/to/capture" if group == "scene" else "")
 
 
 def all_keys(cls: type) -> set[str]:

@@ -34,6 +34,7 @@ METRICS = (
     "lpips_01_8bit",
     "render_seconds",
 )
+NO_TEST_VIEWS = "the scene has no test views; scene.split_every=8 holds out every 8th"
 
 
 class PhotoView(Protocol):
@@ -115,9 +116,9 @@ class EvaluationTable:
 
     @property
     def resolution(self) -> str:
-        """``WxH``, or the range when the views differ."""
+        """``WxH``, or the range when the views differ; empty without views."""
         sizes = sorted({(row.width, row.height) for row in self.rows})
-        return " to ".join(f"{width}x{height}" for width, height in dict.fromkeys((sizes[0], sizes[-1])))
+        return " to ".join(f"{width}x{height}" for width, height in dict.fromkeys(sizes[:1] + sizes[-1:]))
 
     def _present(self, metric: str) -> list[float]:
         if metric not in METRICS:
@@ -148,14 +149,16 @@ def evaluate_views(
     ``lpips_model``: None loads the registered weights; without them the LPIPS columns stay None and
     :attr:`EvaluationTable.missing` says why.
 
+    A scene without test views gives a table without rows, and :attr:`EvaluationTable.missing` says so for every metric.
+
     Raises:
-        ValueError: no view, or another number of renders; and what :mod:`rtgs.evaluate.metrics` refuses, with the
+        ValueError: another number of renders than views; and what :mod:`rtgs.evaluate.metrics` refuses, with the
             view's name.
     """
-    if not views:
-        raise ValueError(f"scene {facts.scene!r} has no test view, so nothing can be measured; hold some out (split)")
     if len(renders) != len(views):
         raise ValueError(f"{len(renders)} renders for {len(views)} test views of scene {facts.scene!r}")
+    if not views:
+        return EvaluationTable(facts, (), dict.fromkeys(METRICS, NO_TEST_VIEWS))
     model, reason = (lpips_model, "") if lpips_model is not None and settings.lpips else load_lpips(settings)
     missing: dict[str, str] = {}
     if model is None:

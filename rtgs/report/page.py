@@ -235,7 +235,8 @@ def _reasons(table: EvaluationTable) -> list[tuple[str, str]]:
     lines = []
     for reason, metrics in grouped.items():
         names = [titles[metric] for metric in titles if metric in metrics]
-        lines.append(("LPIPS, all columns" if metrics == every_lpips else ", ".join(names), reason))
+        joined = "every figure" if metrics >= set(titles) else ", ".join(names)
+        lines.append(("LPIPS, all columns" if metrics == every_lpips else joined, reason))
     return lines
 
 

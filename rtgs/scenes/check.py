@@ -76,7 +76,7 @@ def _photos(capture: Capture, settings: SceneSettings) -> Iterator[Finding]:
         yield Finding("info", f"photos of {len(sizes)} sizes: {listed}", where)
     if transparent:
         what = f"{len(transparent)} photos have an alpha channel: composited on background {settings.background}"
-        yield Finding("info", what, where, "set background to the renderer's")
+        yield Finding("info", what, where, "set scene.background to the renderer's")
 
 
 def _side_images(kind: str, capture: Capture, settings: SceneSettings) -> Iterator[Finding]:
@@ -135,7 +135,9 @@ def _splits_and_points(capture: Capture, settings: SceneSettings) -> Iterator[Fi
     try:
         split = choose_split(capture, sorted({view.name for view in views}), settings)
         if not split.test:
-            yield Finding("warning", "no test views: nothing to measure quality on", split.rule, "set split_every=8")
+            yield Finding(
+                "warning", "no test views: nothing to measure quality on", split.rule, "set scene.split_every=8"
+            )
         extent = camera_extent(_centers(views, split))
     except CaptureError as error:
         yield Finding("error", str(error), str(capture.root))

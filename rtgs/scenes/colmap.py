@@ -28,6 +28,16 @@ def find_model(root: Path, model_dir: str | None = None) -> Path | None:
     return None
 
 
+def incomplete_model(root: Path, model_dir: str | None = None) -> str:
+    """Which files a model that is there in part lacks, in words; empty where there is no trace of one."""
+    for folder in (model_dir,) if model_dir else MODEL_FOLDERS:
+        for suffix in (".bin", ".txt"):
+            missing = [f"{part}{suffix}" for part in _MODEL_PARTS if not (root / folder / f"{part}{suffix}").is_file()]
+            if missing and len(missing) < len(_MODEL_PARTS):
+                return f"the COLMAP model {root / folder} lacks {' and '.join(missing)}"
+    return ""
+
+
 def _model_suffix(folder: Path) -> str | None:
     """.bin goes before .txt, as COLMAP itself reads them."""
     for suffix in (".bin", ".txt"):
@@ -47,7 +57,7 @@ def read_colmap(settings: SceneSettings, root: Path) -> Capture:
         tried = [settings.model_dir] if settings.model_dir else MODEL_FOLDERS
         raise CaptureError(
             f"no COLMAP model in {root}: looked for cameras, images and points3D (.bin or .txt) in {list_some(tried)}; "
-            "set model_dir, or run COLMAP's mapper first"
+            "set scene.model_dir, or run COLMAP's mapper first"
         )
     model = _read_model(folder)
     registered = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
@@ -138,7 +148,7 @@ def find_images(root: Path, images_dir: str | None, names: list[str]) -> Path:
     """
     if images_dir is not None:
         if not (root / images_dir).is_dir():
-            raise CaptureError(f"images folder {root / images_dir} does not exist: correct the setting images_dir")
+            raise CaptureError(f"images folder {root / images_dir} does not exist: correct scene.images_dir")
         return root / images_dir
     shrunk = [path for path in root.glob("images_*") if path.is_dir() and re.fullmatch(r"images_\d+", path.name)]
     shrunk.sort(key=lambda path: (-_picture_area(path, names), path.name))
@@ -208,4 +218,4 @@ def _other_models(folder: Path) -> list[Finding]:
     if not others:
         return []
     what = f"COLMAP split the photos into {len(others) + 1} models, only {folder.name} is read"
-    return [Finding("warning", what, str(folder.parent), "set model_dir to the largest, or match more images")]
+    return [Finding("warning", what, str(folder.parent), "set scene.model_dir to the largest, or match more images")]

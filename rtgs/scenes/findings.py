@@ -62,7 +62,7 @@ def _advice_for_missing(capture: Capture, kind: str) -> str:
     twins = [p.name for p in sorted(folder.glob("*")) if p.stem.lower() == view.image.stem.lower()]
     if twins:
         return f"{folder} holds {twins[0]} instead of {view.image.name}: rename the files as the model names them"
-    return "restore the files, or set images_dir to the folder that holds the photos"
+    return "restore the files, or set scene.images_dir to the folder that holds the photos"
 
 
 def _names(capture: Capture) -> list[Finding]:

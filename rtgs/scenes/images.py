@@ -157,7 +157,7 @@ def same_aspect(size: tuple[int, int], other: tuple[int, int]) -> bool:
 
 def _open(path: Path) -> Image.Image:
     if not path.is_file():
-        raise CaptureError(f"image {path} does not exist: restore the file or correct images_dir")
+        raise CaptureError(f"image {path} does not exist: restore the file or correct scene.images_dir")
     if path.stat().st_size == 0:
         raise CaptureError(f"image {path} is an empty file (0 bytes): copy it again or remove it from the capture")
     try:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rtgs.scenes.blender import is_blender, read_blender
 from rtgs.scenes.capture import Capture
-from rtgs.scenes.colmap import find_model, read_colmap
+from rtgs.scenes.colmap import find_model, incomplete_model, read_colmap
 from rtgs.scenes.embedded import embedded_capture
 from rtgs.scenes.settings import CaptureError, SceneSettings
 from rtgs.scenes.transforms import is_transforms, read_transforms
@@ -22,14 +22,14 @@ def capture_root(settings: SceneSettings) -> Path:
         CaptureError: no path, or a path that is missing or not a folder.
     """
     if not settings.path:
-        raise CaptureError(f"scene {settings.name!r}: the setting path is empty, give the folder of the capture")
+        raise CaptureError(f"scene {settings.name!r}: scene.path is empty, give the folder of the capture")
     if settings.path.startswith(EMBEDDED_PREFIX):
         return embedded_capture(settings.path.removeprefix(EMBEDDED_PREFIX))
     root = Path(os.path.expandvars(settings.path)).expanduser()
     if not root.exists():
-        raise CaptureError(f"capture folder {root} does not exist (from {Path.cwd()}): correct the setting path")
+        raise CaptureError(f"capture folder {root} does not exist (from {Path.cwd()}): correct scene.path")
     if not root.is_dir():
-        raise CaptureError(f"capture {root} is a file: the setting path names the folder that holds images and model")
+        raise CaptureError(f"capture {root} is a file: scene.path names the folder that holds images and model")
     return root
 
 
@@ -47,10 +47,12 @@ def detect_format(root: Path, settings: SceneSettings) -> str:
         return "transforms"
     if is_blender(root):
         return "blender"
+    if partial := incomplete_model(root, settings.model_dir):
+        raise CaptureError(f"{partial}: copy the whole folder, or export the model again")
     content = ", ".join(sorted(p.name for p in root.iterdir())[:10]) or "nothing"
     raise CaptureError(
         f"{root} is no capture: neither a COLMAP model (sparse/0/cameras.bin ...), transforms.json, nor "
-        f"transforms_train.json is there, only {content}; correct the setting path, or run COLMAP on the photos first"
+        f"transforms_train.json is there, but {content}; correct scene.path, or run COLMAP on the photos first"
     )
 
 

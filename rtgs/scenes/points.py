@@ -41,7 +41,7 @@ def camera_extent(centers: np.ndarray) -> float:
     if len(centers) < 2:
         raise CaptureError(
             f"{len(centers)} training view(s): a scene needs at least two photos from different places; "
-            "add photos, or lower the share of test views (split_every)"
+            "add photos, or lower the share of test views (scene.split_every)"
         )
     radius = float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
     if not radius > 1e-6 * max(1e-6, float(np.abs(centers).max())):
@@ -132,5 +132,5 @@ def too_few_points(count: int, found: int, source: str, min_points: int) -> str 
         return None
     return (
         f"only {count} usable points of {found} in {source}, at least {min_points} are needed to place the first "
-        "surfels; match more images, or set points=random to start from random ones"
+        "surfels; match more images, or set scene.points=random to start from random ones"
     )

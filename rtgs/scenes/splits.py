@@ -52,7 +52,7 @@ def read_split_file(path: Path, known: list[str]) -> Split:
         CaptureError: the file is missing or malformed, or names an unknown image, or one image twice.
     """
     if not path.is_file():
-        raise CaptureError(f"split file {path} does not exist: correct the setting split_file")
+        raise CaptureError(f"split file {path} does not exist: correct scene.split_file")
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (json.JSONDecodeError, UnicodeDecodeError) as error:

@@ -113,7 +113,7 @@ def _view(index: int, frame: Any, shared: dict[str, Any], settings: SceneSetting
     if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
         raise CaptureError(f"{where} has no file_path")
     if "transform_matrix" not in frame:
-        raise CaptureError(f"{where} ({frame['file_path']}) has no transform_matrix")
+        raise CaptureError(f"{where} ({frame['file_path']}) has no transform_matrix: export the poses again")
     where = f"{where} ({frame['file_path']})"
     root = path.parent
     name = frame["file_path"].removeprefix("./")

@@ -14,6 +14,7 @@ from PIL import Image
 from rtgs.evaluate import weights as pretrained
 from rtgs.evaluate.evaluate import (
     METRICS,
+    NO_TEST_VIEWS,
     EvaluationSettings,
     RunFacts,
     TimedRender,
@@ -171,13 +172,21 @@ def test_colorize_marks_nan_grey_and_refuses_an_empty_scale() -> None:
 
 def test_bad_calls_name_the_view() -> None:
     renders, photos = capture()
-    with pytest.raises(ValueError, match="no test view"):
-        evaluate_views([], [], FACTS)
     with pytest.raises(ValueError, match="1 renders for 3 test views"):
         evaluate_views(renders[:1], photos, FACTS)
     renders[1] = TimedRender(renders[1].image * math.nan)
     with pytest.raises(ValueError, match=r"view 'two\.jpg': image holds .* NaN"):
         evaluate_views(renders, photos, FACTS)
+
+
+def test_a_scene_without_test_views_gives_tables_that_say_so(tmp_path: Path) -> None:
+    table = evaluate_views([], [], FACTS)
+    assert table.missing == dict.fromkeys(METRICS, NO_TEST_VIEWS)
+    assert (table.mean("psnr"), table.std("psnr"), table.resolution) == (None, None, "")
+    write_json(tmp_path / "metrics.json", table)
+    assert read_json(tmp_path / "metrics.json") == table
+    write_csv(tmp_path / "metrics.csv", table)
+    assert len((tmp_path / "metrics.csv").read_text().splitlines()) == 3
 
 
 def test_summary_table_compares_with_the_paper() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import logging
 import math
@@ -16,10 +17,15 @@ import numpy as np
 import pytest
 import yaml
 from PIL import Image
+from safetensors import SafetensorError
 
+from pipelines import import_scene
+from pipelines.import_scene import ImportParams
 from pipelines.run import friendly_overrides
-from rtgs.cli import main
+from rtgs.cli import main, report_error
 from rtgs.pipeline import Store
+from rtgs.pipeline.step import StepFailed
+from rtgs.scenes.settings import SceneSettings
 
 WIDTH, HEIGHT, VIEWS = 32, 24, 10
 QUICK = (
@@ -204,6 +210,7 @@ def test_a_failing_job_does_not_stop_the_others(words, first, capsys):
     [
         ("method.los.l1=1", ["Key 'los'", "Did you mean loss?"]),
         ("scene.path=/no/such/folder", ["capture folder /no/such/folder does not exist"]),
+        ("scene=/no/such/folder", ["capture folder /no/such/folder does not exist", "correct scene.path"]),
         ("threads=0", ["threads=0 must be at least 1"]),
         ("method.name=3dgs", ["method.name is '3dgs'", "2dgs"]),
     ],
@@ -214,6 +221,42 @@ def test_mistakes_are_one_message_without_traceback(words, override, expected, c
     for text in expected:
         assert text in errors
     assert "Traceback" not in errors
+
+
+def test_a_broken_file_of_ones_own_is_named(words, tmp_path, capsys):
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene" / "mine.yaml").write_text("name: [\n")
+    assert main(["run", "--config-dir", str(tmp_path), "scene=mine"]) == 1
+    errors = capsys.readouterr().err
+    assert "no valid YAML" in errors
+    assert "mine.yaml" in errors
+    assert "Traceback" not in errors
+
+
+@pytest.mark.parametrize(
+    ("error", "advice"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device", "store"), "free some space"),
+        (
+            SafetensorError("Error while serializing: I/O error: No space left on device (os error 28)"),
+            "free some space",
+        ),
+        (OSError(errno.EROFS, "Read-only file system", "outputs"), "RTGS_ROOT"),
+    ],
+)
+def test_what_the_disk_refuses_is_told_with_advice(error, advice, capsys):
+    assert report_error(StepFailed(import_scene.STEP.step(ImportParams(SceneSettings(), "0" * 64, "")), error)) == 1
+    errors = capsys.readouterr().err
+    assert advice in errors
+    assert "Traceback" not in errors
+
+
+def test_a_run_without_test_views_ends_with_a_report_without_figures(words, capsys):
+    assert main([*words, "scene.split_every=0", "name=unmeasured", "tracking=mlflow"]) == 0
+    captured = capsys.readouterr()
+    assert "nothing is measured: the scene has no test views" in captured.err
+    assert "n/a" in captured.out
+    assert "no test views" in (Path("runs") / "unmeasured" / "report.html").read_text(encoding="utf-8")
 
 
 def test_debug_shows_the_traceback(words, monkeypatch, capsys):

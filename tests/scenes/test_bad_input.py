@@ -31,23 +31,23 @@ def refused(root, *parts: str, **keys) -> str:
 
 
 def test_missing_folder(tmp_path):
-    refused(tmp_path / "nowhere", "capture folder .*nowhere does not exist", "correct the setting path")
+    refused(tmp_path / "nowhere", "capture folder .*nowhere does not exist", "correct scene.path")
 
 
 def test_path_that_is_empty_or_a_file(tmp_path):
-    refused("", "the setting path is empty")
+    refused("", "scene.path is empty")
     (tmp_path / "photo.jpg").write_bytes(b"")
     refused(tmp_path / "photo.jpg", "photo.jpg is a file")
 
 
 def test_folder_without_a_capture(tmp_path):
     save_image(tmp_path / "images/a.png", pinhole_picture())
-    refused(tmp_path, "is no capture", "only images", "run COLMAP")
+    refused(tmp_path, "is no capture", "but images", "run COLMAP")
 
 
 def test_named_format_without_its_files(tmp_path):
     save_image(tmp_path / "images/a.png", pinhole_picture())
-    refused(tmp_path, "no COLMAP model .*sparse/0, sparse, colmap/sparse/0", "set model_dir", format="colmap")
+    refused(tmp_path, "no COLMAP model .*sparse/0, sparse, colmap/sparse/0", "set scene.model_dir", format="colmap")
     refused(tmp_path, r"transforms.json does not exist", format="transforms")
     refused(tmp_path, r"transforms_train.json does not exist", format="blender")
 
@@ -71,7 +71,7 @@ def test_images_that_do_not_match_are_listed_with_their_paths(tmp_path):
     root = ColmapCapture(tmp_path).write()
     for index in (2, 5, 7):
         (root / f"images/photo_{index:02d}.png").unlink()
-    message = refused(root, "3 of 10 images do not exist", "set images_dir")
+    message = refused(root, "3 of 10 images do not exist", "set scene.images_dir")
     for index in (2, 5, 7):
         assert str(root / f"images/photo_{index:02d}.png") in message
     assert "photo_03" not in message
@@ -147,15 +147,22 @@ def test_one_single_training_view(tmp_path):
 
 def test_point_cloud_of_three_points(tmp_path):
     root = ColmapCapture(tmp_path, points=3).write()
-    refused(root, "only 3 usable points of 3 in .*points3D.bin", "at least 10 are needed", "set points=random")
+    refused(root, "only 3 usable points of 3 in .*points3D.bin", "at least 10 are needed", "set scene.points=random")
     assert len(load_scene(SceneSettings(path=str(root), points="random", random_points=500)).points) > 400
 
 
 def test_no_points_at_all(tmp_path):
-    refused(ColmapCapture(tmp_path / "a", points=0).write(), "only 0 usable points of 0", "set points=random")
+    refused(ColmapCapture(tmp_path / "a", points=0).write(), "only 0 usable points of 0", "set scene.points=random")
     root = write_transforms(tmp_path / "b", ply_file_path="p.ply")
     write_ply(root / "p.ply", np.full((30, 3), np.nan))
     refused(root, "only 0 usable points of 30 in .*p.ply", "match more images")
+
+
+def test_a_model_of_which_a_file_is_missing(tmp_path):
+    root = ColmapCapture(tmp_path).write()
+    (point_file,) = (root / "sparse" / "0").glob("points3D.*")
+    point_file.unlink()
+    refused(root, f"sparse/0 lacks {point_file.name}", "copy the whole folder")
 
 
 def test_split_file_that_names_unknown_images(tmp_path):

@@ -76,7 +76,7 @@ def test_bad_split_files(tmp_path, content, message):
 
 
 def test_missing_split_file(tmp_path):
-    with pytest.raises(CaptureError, match=r"split file .*split.json does not exist: correct the setting split_file"):
+    with pytest.raises(CaptureError, match=r"split file .*split.json does not exist: correct scene.split_file"):
         read_split_file(tmp_path / "split.json", NAMES)
 
 
