@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from rtgs.cameras import Camera
 from rtgs.native import core
@@ -31,7 +32,8 @@ def rasterize_surfels(
 ) -> RasterBuffers:
     """Render N surfels; :func:`rtgs.render.reference.rasterize_surfels` is its float64 twin.
 
-    Runs on ``torch.get_num_threads()`` threads; the result does not depend on their number, bit for bit.
+    Runs on ``torch.get_num_threads()`` threads; the result does not depend on their number, bit for bit. First
+    derivatives only: a second backward pass through the gradients raises.
 
     Args:
         means: (N, 3) float32 centres, world frame. N = 0 is legal.
@@ -83,7 +85,7 @@ def _array(tensor: Tensor | None):
 
 
 def _empty(wanted: bool, *shape: int) -> Tensor | None:
-    return torch.empty(shape) if wanted else None
+    return torch.empty(shape, dtype=torch.float32) if wanted else None
 
 
 class _Rasterize(torch.autograd.Function):
@@ -97,8 +99,8 @@ class _Rasterize(torch.autograd.Function):
         native = core.Rasterization(call.native_camera(), options.normal, needs_depth)
         native.project(*arrays, call.threads)
 
-        image = torch.empty(features.shape[1], height, width)
-        alpha = torch.empty(height, width)
+        image = torch.empty(features.shape[1], height, width, dtype=torch.float32)
+        alpha = torch.empty(height, width, dtype=torch.float32)
         depth = _empty(options.depth, height, width)
         median_depth = _empty(options.median_depth, height, width)
         normal = _empty(options.normal, 3, height, width)
@@ -125,6 +127,7 @@ class _Rasterize(torch.autograd.Function):
         return image, alpha, depth, median_depth, normal, distortion, weight_sum
 
     @staticmethod
+    @once_differentiable
     def backward(ctx, g_image, g_alpha, g_depth, g_median, g_normal, g_distortion, _g_weight_sum):  # type: ignore[override]
         *inputs, image, normal, depth, distortion = ctx.saved_tensors
         upstream = [g_image, g_normal, g_alpha, g_depth, g_median, g_distortion]
@@ -132,9 +135,7 @@ class _Rasterize(torch.autograd.Function):
             return (None,) * 8
         means = inputs[0]
         like = [*inputs, means[:, :2]]
-        gradients = [
-            torch.empty(t.shape) if needed else None for t, needed in zip(like, ctx.needs_input_grad, strict=False)
-        ]
+        gradients = [_empty(needed, *t.shape) for t, needed in zip(like, ctx.needs_input_grad, strict=False)]
         ctx.native.backward(
             *(_array(t) for t in inputs),
             _array(image),

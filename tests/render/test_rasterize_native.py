@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -14,6 +17,8 @@ from rtgs.render.buffers import RasterOptions
 from rtgs.render.rasterize import rasterize_surfels
 
 from .native_scene import PICTURES, SCENE_OPTIONS, NativeScene, native_scene
+
+ROOT = Path(__file__).parents[2]
 
 
 def everything(scene: NativeScene, seed: int = 0) -> list[Tensor]:
@@ -65,6 +70,39 @@ def test_a_second_backward_pass_gives_the_same_bits():
     loss = scene.render(SCENE_OPTIONS, leaves).features.square().sum()
     first = torch.autograd.grad(loss, leaves, retain_graph=True)
     assert_same_bits(list(first), list(torch.autograd.grad(loss, leaves)))
+
+
+def test_second_derivatives_are_refused_not_dropped():
+    scene = native_scene(60, 30, 20, 3)
+    leaves = scene.leaves()
+    image = scene.render(SCENE_OPTIONS, leaves).features
+    (gradient,) = torch.autograd.grad(image.square().sum(), leaves[0], create_graph=True)
+    assert gradient.requires_grad  # a constant would silently drop what depends on it
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        (gradient.square().sum() + image.sum()).backward()
+
+
+def test_the_default_dtype_does_not_matter():
+    scene = native_scene(60, 30, 20, 3)
+    expected = everything(scene)
+    torch.set_default_dtype(torch.float64)
+    try:
+        leaves = scene.leaves()
+        buffers = scene.render(SCENE_OPTIONS, leaves)
+        gradients = torch.autograd.grad(buffers.features.sum(), leaves)
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert torch.equal(buffers.features.detach(), expected[PICTURES.index("features")])
+    assert all(gradient.dtype == torch.float32 for gradient in gradients)
+
+
+def test_a_render_alive_at_exit_ends_quietly():
+    script = (
+        "import torch\nfrom tests.render.native_scene import SCENE_OPTIONS, native_scene\n"
+        "scene = native_scene(60, 30, 20, 3)\nbuffers = scene.render(SCENE_OPTIONS, scene.leaves())"
+    )
+    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_several_renders_before_one_backward_pass():
