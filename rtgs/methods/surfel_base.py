@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from rtgs.cameras import Camera
+from rtgs.errors import RtgsError
 from rtgs.gaussians.initialize import surfels_from_points
 from rtgs.methods.base import Decision, LossTerm, LossTerms, RenderedView, RenderOptions, Stage, StepEvent
 from rtgs.methods.surfel_set import SurfelSet
@@ -22,7 +23,7 @@ from rtgs.train.losses import (
     photometric_loss,
     surface_depth,
 )
-from rtgs.train.schedule import check_schedule, densify_due, loss_start, opacity_reset_due, sh_degree_at
+from rtgs.train.schedule import check_schedule, densify_ahead, densify_due, loss_start, opacity_reset_due, sh_degree_at
 from rtgs.train.settings import MethodSettings, ScheduleSettings
 
 if TYPE_CHECKING:
@@ -94,16 +95,16 @@ class SurfelMethod:
         )
 
     def render(self, camera: Camera, step: int, options: RenderOptions | None = None) -> RenderedView:
-        """Render one view; with ``options=None`` (training) density control watches it."""
+        """Render one view; with ``options=None`` (training) density control watches it while it will run again."""
         buffers = self.rasterize_base(camera, step, options)
         return RenderedView(camera, buffers.features, buffers)
 
     def rasterize_base(self, camera: Camera, step: int, options: RenderOptions | None) -> RasterBuffers:
         """Rasterise the base set: its SH colours as features."""
-        training = options is None
+        watched = options is None and densify_ahead(self.schedule, step)
         wanted = self.training_options(step) if options is None else options
         surfels = self.base.activated(camera.center.float(), self.sh_degree(step))
-        probe = self.base.new_probe() if training else None
+        probe = self.base.new_probe() if watched else None
         buffers = rasterize_surfels(
             surfels.means,
             surfels.tangent_u,
@@ -113,7 +114,7 @@ class SurfelMethod:
             surfels.colors,
             camera,
             background=self._background,
-            options=self.raster_options(wanted, weight_sum=training),
+            options=self.raster_options(wanted, weight_sum=watched),
             screen_probe=probe,
         )
         if probe is not None and buffers.weight_sum is not None:
@@ -180,12 +181,23 @@ class SurfelMethod:
         return mono_normal_loss(buffers.normal, target, camera, form=loss.mono_normal_form, weight=weight)
 
     def after_step(self, step: int) -> tuple[StepEvent, ...]:
-        """Adam, then what the schedule asks of the base set before the next step."""
+        """Adam, then what the schedule asks of the base set before the next step.
+
+        Raises:
+            RtgsError: density control left no surfel.
+        """
         self.base.step(step, self.sh_degree(step))
         following = step + 1
         events = []
         if densify_due(self.schedule, following):
             report = self.base.densify(self.generator)
+            if report.total == 0:
+                raise RtgsError(
+                    f"density control removed all {report.pruned} surfels of set {self.base.name!r} before step "
+                    f"{following}: every opacity was below method.density.min_opacity "
+                    f"{self.settings.density.min_opacity}. Lower it, or the learning rate "
+                    "method.optimizer.opacity_logits; the last checkpoint is intact"
+                )
             detail = f"{report.cloned} cloned, {report.split} split, {report.pruned} pruned, {report.total} surfels"
             events.append(StepEvent("density", self.base.name, detail))
         if opacity_reset_due(self.schedule, following):

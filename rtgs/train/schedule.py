@@ -33,15 +33,26 @@ def sh_degree_at(schedule: ScheduleSettings, step: int, largest: int) -> int:
     return min(largest, max(0, step - schedule.sh_from) // schedule.sh_every)
 
 
+def densify_end(schedule: ScheduleSettings) -> int:
+    """First step before which nothing is densified or reset any more: a change needs steps after it to learn from."""
+    return min(schedule.densify_until, schedule.total)
+
+
 def densify_due(schedule: ScheduleSettings, step: int) -> bool:
     """Whether density control runs before ``step``: inside the open window (from, until), every ``densify_every``."""
-    return schedule.densify_from < step < schedule.densify_until and step % schedule.densify_every == 0
+    return schedule.densify_from < step < densify_end(schedule) and step % schedule.densify_every == 0
+
+
+def densify_ahead(schedule: ScheduleSettings, step: int) -> bool:
+    """Whether density control still runs after ``step``, so that what it would learn from this step's view counts."""
+    last = (densify_end(schedule) - 1) // schedule.densify_every * schedule.densify_every
+    return last > max(step, schedule.densify_from)
 
 
 def opacity_reset_due(schedule: ScheduleSettings, step: int) -> bool:
     """Whether opacities are reset before ``step``: every ``opacity_reset_every``, only while densifying."""
     every = schedule.opacity_reset_every
-    return every > 0 and 0 < step < schedule.densify_until and step % every == 0
+    return every > 0 and 0 < step < densify_end(schedule) and step % every == 0
 
 
 def loss_start(share: float, total: int) -> int:

@@ -8,11 +8,12 @@ import pytest
 import torch
 from training_cases import HEIGHT, WIDTH, small_method, small_scene, small_schedule
 
+from rtgs.errors import RtgsError
 from rtgs.methods import METHOD_NAMES, RenderOptions, Stage, create_method, method_stages
 from rtgs.methods import surfel_base as module
 from rtgs.render.buffers import RasterOptions
 from rtgs.train.seeds import generator_for
-from rtgs.train.settings import LossSettings, MethodSettings, RenderSettings
+from rtgs.train.settings import DensitySettings, LossSettings, MethodSettings, RenderSettings
 
 
 def make(settings: MethodSettings | None = None, *, normals: bool = False, **schedule: int):
@@ -90,6 +91,21 @@ def test_outputs_are_rendered_only_while_their_loss_is_on(monkeypatch):
     assert not (after.distortion)
 
 
+def test_density_control_stops_watching_after_its_last_call(monkeypatch):
+    assert rendered_options(monkeypatch, small_method(), 39).weight_sum  # small_schedule densifies before 20 and 40
+    assert not rendered_options(monkeypatch, small_method(), 40).weight_sum
+
+
+def test_a_run_that_loses_every_surfel_stops_and_says_why():
+    method, scene = make()
+    for step in range(19):
+        train_step(method, scene, step)
+    with torch.no_grad():
+        method.sets[0].surfels.opacity_logits.fill_(-9)
+    with pytest.raises(RtgsError, match=r"removed all \d+ surfels of set 'base' before step 20: .*min_opacity 0\.05"):
+        train_step(method, scene, 19)
+
+
 def test_near_and_far_scale_with_the_scene(monkeypatch):
     settings = replace(small_method(), render=RenderSettings(near=0.02, far=20.0))
     options = rendered_options(monkeypatch, settings, 0)
@@ -155,7 +171,8 @@ def test_views_without_normals_among_others_are_left_out_of_the_mono_loss():
 
 
 def test_density_control_and_resets_happen_as_scheduled_and_are_told():
-    method, scene = make(densify_from=5, densify_until=45, densify_every=20, opacity_reset_every=30)
+    faint = replace(small_method(), density=DensitySettings(min_opacity=0.005))  # 10 steps do not undo a reset
+    method, scene = make(faint, densify_from=5, densify_until=45, densify_every=20, opacity_reset_every=30)
     events = {step: train_step(method, scene, step)[1] for step in range(41)}
     kinds = {step + 1: [event.kind for event in found] for step, found in events.items() if found}
     assert kinds == {20: ["density"], 30: ["opacity_reset"], 40: ["density"]}

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from rtgs.train.schedule import (
     ViewOrder,
     check_schedule,
+    densify_ahead,
     densify_due,
     loss_start,
     opacity_reset_due,
@@ -28,6 +29,22 @@ def test_opacity_is_reset_only_while_densifying():
     schedule = ScheduleSettings(total=10_000, densify_until=7000, opacity_reset_every=3000)
     assert [step for step in range(10_000) if opacity_reset_due(schedule, step)] == [3000, 6000]
     assert not any(opacity_reset_due(ScheduleSettings(opacity_reset_every=0), step) for step in range(0, 20_000, 100))
+
+
+def test_nothing_is_densified_or_reset_before_a_step_that_never_comes():
+    schedule = ScheduleSettings(total=3000, densify_until=15_000, densify_every=100, opacity_reset_every=3000)
+    assert densify_due(schedule, 2900)
+    assert not densify_due(schedule, 3000)
+    assert not opacity_reset_due(schedule, 3000)
+
+
+@given(total=st.integers(1, 60), begin=st.integers(0, 40), until=st.integers(0, 80), every=st.integers(1, 15))
+@settings(max_examples=100, deadline=None)
+def test_density_control_watches_as_long_as_it_will_run_again(total: int, begin: int, until: int, every: int):
+    schedule = ScheduleSettings(total=total, densify_from=begin, densify_until=until, densify_every=every)
+    due = [step for step in range(total + 1) if densify_due(schedule, step)]
+    for step in range(total):
+        assert densify_ahead(schedule, step) == any(later > step for later in due)
 
 
 def test_sh_degree_grows_to_what_the_surfels_hold():
