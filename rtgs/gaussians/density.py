@@ -93,6 +93,10 @@ class DensityControl:
         for name in ("min_opacity", "reset_opacity"):
             if not 0 < getattr(settings, name) < 1:
                 raise ValueError(f"density.{name} {getattr(settings, name)} must be between 0 and 1")
+        if settings.cap_turnover is not None and not settings.cap_turnover >= 0:
+            raise ValueError(
+                f"density.cap_turnover {settings.cap_turnover} must be at least 0, or null for the published rule"
+            )
         if settings.split_shrink <= 0 or settings.too_large_shrink <= 0:
             raise ValueError("density.split_shrink and density.too_large_shrink must be positive")
         self.settings = settings
@@ -166,8 +170,9 @@ class DensityControl:
         too_large_pruned = too_large & self._lowest_weights(s.low_weight_share)
         too_large_split = too_large & ~too_large_pruned
         rest = high_signal & ~transparent & ~too_large
-        room = int((1 + s.cap_turnover) * self.cap) - int((~transparent & ~too_large_pruned).sum())
-        rest = highest(rest, self.mean_signal, room)
+        if s.cap_turnover is not None:
+            room = int((1 + s.cap_turnover) * self.cap) - int((~transparent & ~too_large_pruned).sum())
+            rest = highest(rest, self.mean_signal, room)
         split = rest & (size > s.size_border * self.extent)
         clone = rest & ~split
 

@@ -64,9 +64,10 @@ class DensitySettings:
     reset_opacity: float = 0.01
     max_surfels: int = 2_000_000
     cap_share: float = 0.9  # above this share of max_surfels (the cap) the lowest mean weights go
-    # Share of the cap that one call may add beyond it, highest signals first, before the lowest weights go. EnvGS has
-    # no such limit and hardly meets its cap of 1.8 million; under a small cap half of the set would change every call.
-    cap_turnover: float = 0.05
+    # Share of the cap that one call may add beyond it, highest signals first, before the lowest weights go. None: any
+    # number, as in EnvGS, which hardly meets its cap; presets with a small cap set it, or half of their set would
+    # change every call.
+    cap_turnover: float | None = None
 
 
 @dataclass(frozen=True)

@@ -133,9 +133,7 @@ def test_too_large_comes_before_high_signal_and_can_be_off():
 
 def test_cap_removes_the_lowest_weights_and_children_inherit_theirs():
     surfels, adam = scene([SMALL] * 6)
-    control = control_of(
-        [COLD, COLD, COLD, COLD, HOT, HOT], [5, 1, 4, 2, 3, 0.5], max_surfels=5, cap_share=0.8, cap_turnover=1.0
-    )
+    control = control_of([COLD, COLD, COLD, COLD, HOT, HOT], [5, 1, 4, 2, 3, 0.5], max_surfels=5, cap_share=0.8)
     report = run(surfels, adam, control)
     assert report == DensityReport(cloned=2, split=0, pruned=4, total=4)
     assert_in_step(surfels, adam, [1, 3, 5], [5])
@@ -256,6 +254,8 @@ def test_bad_observations_say_what_is_wrong():
         control.observe(torch.tensor([[0.0, 0], [0, 0], [0, float("nan")]]), torch.zeros(3))
     with pytest.raises(ValueError, match="scene extent 0"):
         DensityControl(DensitySettings(), 0)
+    with pytest.raises(ValueError, match=r"density.cap_turnover -0.1 must be at least 0"):
+        DensityControl(DensitySettings(cap_turnover=-0.1), 1.0)
     with pytest.raises(ValueError, match=r"density.min_opacity 1.5"):
         DensityControl(DensitySettings(min_opacity=1.5), 1.0)
 
