@@ -6,6 +6,7 @@ row j, has its centre at (i + 0.5, j + 0.5), COLMAP's convention.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -25,7 +26,8 @@ class Camera:
     """A pinhole camera without distortion (importers undistort).
 
     ``rotation`` (3, 3) and ``translation`` (3,) are float64 and map world to camera: x_cam = R x + t. Focal lengths and
-    principal point are in pixels of a ``width`` x ``height`` image; fx != fy and an off-centre principal point are legal.
+    principal point are in pixels of a ``width`` x ``height`` image; fx != fy and an off-centre principal point are
+    legal.
     """
 
     rotation: Tensor
@@ -52,6 +54,10 @@ class Camera:
             raise ValueError(f"camera {self.name!r}: image size {self.width}x{self.height} must be at least 1x1")
         if not (0 < self.fx < float("inf") and 0 < self.fy < float("inf")):
             raise ValueError(f"camera {self.name!r}: focal lengths fx={self.fx}, fy={self.fy} must be positive")
+        if not (math.isfinite(self.cx) and math.isfinite(self.cy)):
+            raise ValueError(
+                f"camera {self.name!r}: principal point ({self.cx}, {self.cy}) must be finite; calibrate again"
+            )
 
     @property
     def center(self) -> Tensor:

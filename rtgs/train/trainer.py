@@ -259,13 +259,14 @@ class Trainer:
 
 
 def scene_digest(scene: Scene) -> str:
-    """Digest of what training sees of a scene: cameras, points, and a sample of every image."""
+    """Digest of what training sees of a scene: cameras, points, and a sample of every image and normal map."""
     sha = hashlib.sha256()
     for view in (*scene.train, *scene.test):
         camera = view.camera
         sha.update(repr((view.name, camera.fx, camera.fy, camera.cx, camera.cy, *view.image.shape)).encode())
         for tensor in (camera.rotation, camera.translation, view.image.flatten()[::97]):
             sha.update(tensor.contiguous().numpy().tobytes())
+        sha.update(b"no normals" if view.normal is None else view.normal.flatten()[::97].contiguous().numpy().tobytes())
     sha.update(scene.points.contiguous().numpy().tobytes())
     return sha.hexdigest()[:16]
 

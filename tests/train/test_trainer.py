@@ -166,9 +166,10 @@ def test_metrics_are_flushed_when_training_breaks():
     assert memory.closed == 1
 
 
-def test_scene_digest_tells_images_cameras_and_points():
+def test_scene_digest_tells_images_normals_cameras_and_points():
     scene = small_scene()
     view = scene.train[0]
+    facing = torch.tensor([0.0, 0.0, -1.0]).reshape(3, 1, 1).expand_as(view.image)
     brighter = replace(view, image=view.image * 0.9)
     moved = replace(view, camera=replace(view.camera, translation=view.camera.translation + 0.1))
     digests = {
@@ -176,6 +177,8 @@ def test_scene_digest_tells_images_cameras_and_points():
         scene_digest(replace(scene, train=(brighter, *scene.train[1:]))),
         scene_digest(replace(scene, train=(moved, *scene.train[1:]))),
         scene_digest(replace(scene, points=scene.points + 0.1)),
+        scene_digest(replace(scene, train=(replace(view, normal=facing), *scene.train[1:]))),
+        scene_digest(replace(scene, train=(replace(view, normal=-facing), *scene.train[1:]))),
     }
-    assert len(digests) == 4
+    assert len(digests) == 6
     assert scene_digest(scene) == scene_digest(small_scene())
