@@ -17,10 +17,11 @@ from rtgs.render.rasterize import rasterize_surfels
 from rtgs.render.reference import rasterize_surfels as twin
 
 from .comparison import pixel_error, relative_error
-from .scenes import OUTPUTS, identity_camera, join, surfel
+from .scenes import ALL_OUTPUTS, OUTPUTS, identity_camera, join, output, surfel
 from .strategies import NAMES, Recipe, SurfelScene, SurfelTensors, wild
 from .twin_runs import answer, expected, run
 
+OPTIONAL = ("depth", "median_depth", "normal", "distortion", "weight_sum")
 OFF = (0.013, -0.021)  # world offset that keeps hand-made surfels off exact pixel centres
 
 
@@ -138,6 +139,35 @@ def test_optional_outputs_alone_are_the_same_and_the_others_none(isa: str, name:
     for other in ("depth", "median_depth", "normal", "distortion", "weight_sum"):
         assert (getattr(alone, other) is None) is (other != name)
     assert (relative_error(getattr(alone, name), getattr(expected, name)) > 1e-5).double().mean() <= 0.02
+
+
+@pytest.mark.parametrize(
+    "wanted",
+    [
+        (),
+        ("weight_sum",),
+        ("normal",),
+        ("depth",),
+        ("median_depth",),
+        ("distortion",),
+        ("depth", "normal", "weight_sum"),
+    ],
+    ids=lambda wanted: "+".join(wanted) or "none",
+)
+def test_gradients_with_only_some_outputs(isa: str, wanted: tuple[str, ...]):
+    """Each combination that training asks for has record layouts and kernels of its own."""
+    exact = expected(Recipe("crowded", 7, 150, 49, 35, 3))
+    options = replace(ALL_OUTPUTS, **{name: name in wanted for name in OPTIONAL})
+    pictures = ["features", "alpha", *(name for name in wanted if name != "weight_sum")]
+    gradients = []
+    for rasterizer, dtype in ((rasterize_surfels, torch.float32), (twin, torch.float64)):
+        leaves = exact.scene.surfels.leaves(dtype).all()
+        probe = torch.zeros(len(leaves[0]), 2, dtype=dtype, requires_grad=True)
+        buffers = rasterizer(*leaves, exact.scene.camera, options=options, screen_probe=probe)
+        loss = sum((output(buffers, name) * exact.upstream[name].to(dtype)).sum() for name in pictures)
+        gradients.append(torch.autograd.grad(loss, (*leaves, probe)))  # type: ignore[arg-type]
+    for name, native, reference in zip((*NAMES, "screen_probe"), *gradients, strict=True):
+        assert relative_error(native, reference).max() <= 1e-4, name
 
 
 def test_nothing_is_nan_or_inf_for_any_finite_input(isa: str):
