@@ -10,7 +10,7 @@ namespace rtgs::RTGS_ISA {
 namespace {
 
 constexpr int kDigitBits = 11, kDigits = 1 << kDigitBits;
-constexpr int kMaxThreads = 64;  // of the sort: its histograms live on the stack of the caller's frame
+constexpr int kMaxThreads = 64;  // of the sort: bounds the histograms, see sort_scratch
 
 struct Chunk {
   int64_t begin, end;
@@ -55,8 +55,8 @@ void radix_pass(const DepthKey* in, DepthKey* out, int64_t count, int shift, int
 
 }  // namespace
 
-// Visible surfels by (depth, id) into keys; returns how many. keys and spare hold `count` each; the histograms follow
-// in `cursors`-like scratch of the caller's thread.
+// Visible surfels by (depth, id) into keys; returns how many. keys and spare hold count + 1 each; scratch holds
+// sort_scratch() numbers for the histograms.
 int64_t sort_by_depth(const ProjectedSurfels& surfels, int64_t count, DepthKey* keys, DepthKey* spare, int64_t* scratch,
                       int threads) {
   int64_t visible = 0;
