@@ -77,7 +77,7 @@ def _views(table: EvaluationTable, inputs: Mapping[str, Path], count: int) -> tu
         maps = read_render(inputs["render"], name)
         photo = photos[name]
         shown = {key: maps.get(key) for key in ("depth", "normal", "alpha")}
-        views.append(ReportView(name, photo.camera, photo.image, maps["image"], role, **shown))
+        views.append(ReportView(name, photo.camera, photo.image, maps["image"], role, mask=photo.mask, **shown))
     return tuple(views)
 
 

@@ -18,6 +18,7 @@ from rtgs.mesh.guide import MeshGuide
 from rtgs.mesh.triangles import TriangleMesh
 
 DEPTH_COLORMAP = "turbo"
+MASK_COLOR = (60, 220, 230)  # cyan: no colour of the error map
 COVERED = 0.5  # alpha from which a pixel counts when the depth range is chosen
 DEPTH_QUANTILES = (0.02, 0.98)
 # Colours of the curves: blue, orange, green, red-violet, grey; told apart on light and dark grounds.
@@ -83,6 +84,14 @@ def alpha_picture(alpha: Tensor) -> np.ndarray:
     """(H, W) accumulated alpha as grey levels, black 0 and white 1."""
     grey = (alpha.detach().clamp(0, 1) * 255).round().nan_to_num(nan=0.0).to(torch.uint8)
     return grey.unsqueeze(-1).expand(-1, -1, 3).contiguous().numpy()
+
+
+def outlined(pixels: np.ndarray, mask: Tensor) -> np.ndarray:
+    """(H, W, 3) uint8 with the border of ``mask`` (H, W) bool drawn two pixels thick, one on either side."""
+    from skimage.segmentation import find_boundaries
+
+    border = find_boundaries(mask.numpy(), mode="thick")
+    return np.where(border[..., None], np.array(MASK_COLOR, dtype=np.uint8), pixels)
 
 
 def mesh_picture(mesh: TriangleMesh, camera: Camera) -> np.ndarray:
@@ -166,7 +175,8 @@ def curve_svg(curves: Sequence[Curve], *, label: str, log: bool = False) -> str:
                 borderaxespad=0,
             )
         buffer = io.StringIO()
-        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None}, transparent=True)
+        no_metadata = dict.fromkeys(("Date", "Creator", "Format", "Type"))  # RDF, full of addresses
+        figure.savefig(buffer, format="svg", metadata=no_metadata, transparent=True)
     svg = buffer.getvalue()
     svg = svg[svg.index("<svg") :]
     return svg.replace(_INK, "var(--ink-soft)").replace(_GRID, "var(--line)")

@@ -25,6 +25,7 @@ from rtgs.report.figures import (
     depth_picture,
     image_bytes,
     normal_picture,
+    outlined,
 )
 
 TARGET_BYTES = 5_000_000  # of all pictures together, as base64
@@ -76,6 +77,7 @@ class ReportView:
     depth: Tensor | None = None  # (H, W) z-depth of the surface, world units (divided by alpha)
     normal: Tensor | None = None  # (3, H, W) world frame
     alpha: Tensor | None = None  # (H, W)
+    mask: Tensor | None = None  # (H, W) bool, where the masked figures are measured; outlined in the error map
 
 
 @dataclass(frozen=True)
@@ -289,15 +291,18 @@ class _Drawn:
 
 def _draw(view: ReportView) -> list[_Drawn]:
     """Photo, render, then the maps, as pixels."""
+    error, caption = error_map(view.render, view.photo), "mean over RGB of |render − photo|"
+    if view.mask is not None and view.mask.any():
+        error, caption = outlined(error, view.mask), f"{caption}; outlined: the mask"
     drawn = [
         _Drawn(to_bytes(view.photo), Picture("", "Photo")),
         _Drawn(to_bytes(view.render), Picture("", "Render")),
         _Drawn(
-            error_map(view.render, view.photo),
+            error,
             Picture(
                 "",
                 "Error",
-                "mean over RGB of |render − photo|",
+                caption,
                 colorbar_uri(ERROR_COLORMAP),
                 "0",
                 f"≥ {ERROR_FULL_SCALE:g}",

@@ -16,7 +16,7 @@ from PIL import Image
 from rtgs.cameras import Camera
 from rtgs.evaluate.evaluate import METRICS, EvaluationTable, RunFacts, ViewScore
 from rtgs.mesh.triangles import TriangleMesh
-from rtgs.report.figures import Curve, curve_svg, depth_picture, image_bytes, mesh_picture, normal_picture
+from rtgs.report.figures import Curve, curve_svg, depth_picture, image_bytes, mesh_picture, normal_picture, outlined
 from rtgs.report.page import (
     PICTURE_STEPS,
     TARGET_BYTES,
@@ -124,6 +124,8 @@ def test_page_is_self_contained(tmp_path: Path) -> None:
     assert "link" not in parsed.tags
     assert "default-src 'none'" in page
     assert not re.search(r"url\((?!#)", page)
+    namespaces = {"http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"}  # names, never fetched
+    assert set(re.findall(r"https?://[\w./-]+", page)) <= namespaces
     pictures = [address for address in parsed.addresses if address.startswith("data:image/jpeg")]
     assert len(pictures) == 2 * 6 + 1  # photo, render, error, depth, normal, alpha for two views, and the mesh
     with Image.open(io.BytesIO(base64.b64decode(pictures[0].split(",")[1]))) as picture:
@@ -236,6 +238,23 @@ def test_normals_are_shown_in_the_camera_frame() -> None:
     facing[0] = 1  # camera frame (0, 0, -1): towards the viewer
     assert normal_picture(facing, camera)[0, 0].tolist() == [128, 128, 255]
     assert normal_picture(torch.zeros(3, 2, 2), camera)[0, 0].tolist() == [128, 128, 128]
+
+
+def test_the_mask_is_outlined_in_the_error_map() -> None:
+    mask = torch.zeros(12, 16, dtype=torch.bool)
+    mask[3:9, 4:12] = True
+    pixels = outlined(np.zeros((12, 16, 3), dtype=np.uint8), mask)
+    drawn = pixels.any(-1)
+    assert drawn[2:4, 4:12].all()  # one pixel outside, one inside
+    assert not drawn[5:7, 6:10].any()
+    assert not drawn[:2].any()
+    view = report_view("view_0.jpg")
+    size = view.photo.shape[1:]
+    shown = torch.zeros(size, dtype=torch.bool)
+    shown[: size[0] // 2] = True
+    for marked, expected in ((shown, True), (torch.zeros(size, dtype=torch.bool), False), (None, False)):
+        data = replace(full_data(), views=(replace(view, mask=marked),))
+        assert ("outlined: the mask" in render_report(data)) is expected
 
 
 def test_pictures_are_shrunk_never_enlarged() -> None:
