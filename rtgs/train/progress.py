@@ -83,13 +83,15 @@ class BarProgress:
     def __init__(self, stream: TextIO | None = None) -> None:
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+        from rich.table import Column
 
+        whole = Column(no_wrap=True)
         self._bar = Progress(
             TextColumn("{task.description}"),
             BarColumn(bar_width=10),
-            MofNCompleteColumn(),
-            TimeRemainingColumn(),
-            TextColumn("{task.fields[status]}"),
+            MofNCompleteColumn(table_column=whole),
+            TimeRemainingColumn(table_column=whole.copy()),
+            TextColumn("{task.fields[status]}", table_column=Column()),  # wraps where the terminal is too narrow
             console=Console(file=stream or sys.stderr),
             refresh_per_second=4,
         )

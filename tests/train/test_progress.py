@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import io
+import re
+from types import SimpleNamespace
 
+import pytest
+
+from rtgs.train import progress
 from rtgs.train.progress import BarProgress, LineProgress, StepReport, progress_for
 
 
@@ -17,18 +22,23 @@ def test_a_terminal_gets_a_bar_and_a_file_gets_lines():
     assert isinstance(progress_for(io.StringIO()), LineProgress)
 
 
-def test_the_bar_shows_numbers_and_notes(monkeypatch):
+@pytest.mark.parametrize(("total", "surfels", "seconds"), [(2000, 12_345, 20.0), (60_000, 1_234_567, 0.001)])
+def test_the_bar_shows_numbers_and_notes(monkeypatch, total: int, surfels: int, seconds: float):
     monkeypatch.setenv("COLUMNS", "80")
     monkeypatch.setenv("TERM", "xterm")
+    clock = iter((100.0, 100.0 + seconds))
+    monkeypatch.setattr(progress, "time", SimpleNamespace(monotonic=lambda: next(clock)))
     stream = Terminal()
     bar = BarProgress(stream)
-    bar.start("diffuse", 0, 2000)
+    bar.start("diffuse", 0, total)
     bar.note("no mono loss: [no] normals")
-    bar.advance(StepReport(1000, 0.125, 27.5, 12_345))
+    bar.advance(StepReport(total // 2, 0.125, 27.5, surfels))
     bar.close()
-    shown = stream.getvalue()
-    for part in ("diffuse", "1000/2000", "loss 0.125", "27.5 dB", "12,345 surfels", "/s", "[no] normals"):
+    shown = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", stream.getvalue())
+    counts = f"{total // 2}/{total}"
+    for part in ("diffuse", counts, "loss 0.125", "27.5 dB", f"{surfels:,}", "surfels", "/s", "[no] normals"):
         assert part in shown
+    assert "…" not in shown
 
 
 def test_lines_come_at_most_every_few_seconds_and_at_the_end():
