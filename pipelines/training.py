@@ -86,11 +86,11 @@ def train_stage(params: StageParams, context: StepContext) -> None:
 
 def _start_from_stage_before(context: StepContext, checkpoints: Path) -> None:
     """A later stage goes on from the state at the end of the one before, unless it has a checkpoint of its own."""
+    from rtgs.train.checkpoint import adopt_checkpoint
+
     before = [folder for name, folder in context.inputs.items() if name.startswith("train_")]
-    if not before or any(checkpoints.glob("step_*")):
-        return
-    record = json.loads((before[-1] / CHECKPOINT_FOLDER / "record.json").read_text(encoding="utf-8"))["record"]
-    shutil.copytree(before[-1] / CHECKPOINT_FOLDER, checkpoints / f"step_{record['step']:08d}")
+    if before and not any(checkpoints.glob("step_*")):
+        adopt_checkpoint(before[-1] / CHECKPOINT_FOLDER, checkpoints)
 
 
 def _finite(value: object) -> object:

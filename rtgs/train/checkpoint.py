@@ -106,6 +106,26 @@ def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> Path:
     return final
 
 
+def adopt_checkpoint(source: Path, folder: Path) -> Path:
+    """Copy a verified checkpoint folder ``source`` into ``folder`` for a run that goes on from it; returns its path.
+
+    Atomic like :func:`save_checkpoint`: a kill leaves the whole copy or none.
+
+    Raises:
+        CheckpointError: ``source`` is damaged.
+    """
+    final = checkpoint_path(folder, load_checkpoint(source).record.step)
+    folder.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(prefix=_TEMPORARY, dir=folder))
+    for name in (TENSORS_FILE, RECORD_FILE):
+        shutil.copyfile(source / name, temporary / name)
+        _flush(temporary / name)
+    _flush(temporary)
+    os.rename(temporary, final)
+    _flush(folder)
+    return final
+
+
 def load_checkpoint(path: Path) -> Checkpoint:
     """Read one checkpoint folder (``.../step_00000500``) and verify it.
 

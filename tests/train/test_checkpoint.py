@@ -16,6 +16,7 @@ from rtgs.train.checkpoint import (
     CheckpointError,
     CheckpointRecord,
     RunSettings,
+    adopt_checkpoint,
     canonical_json,
     check_resumable,
     checkpoint_path,
@@ -51,6 +52,29 @@ def make(step: int = 10, settings: RunSettings | None = None) -> Checkpoint:
         "strided": torch.arange(12.0).reshape(3, 4).T,
     }
     return Checkpoint(record, tensors)
+
+
+def test_a_checkpoint_is_adopted_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    source = save_checkpoint(tmp_path / "before", make(40))
+    folder = tmp_path / "after"
+
+    class Killed(BaseException):
+        pass
+
+    def dying(*_arguments):
+        raise Killed
+
+    monkeypatch.setattr(module, "_flush", dying)
+    with pytest.raises(Killed):
+        adopt_checkpoint(source, folder)
+    monkeypatch.undo()
+    assert load_newest(folder, warn=pytest.fail) is None
+    adopted = adopt_checkpoint(source, folder)
+    assert adopted == checkpoint_path(folder, 40)
+    assert load_checkpoint(adopted).record == load_checkpoint(source).record
+    (source / "state.safetensors").write_bytes(b"cut")
+    with pytest.raises(CheckpointError, match=r"state\.safetensors is damaged"):
+        adopt_checkpoint(source, tmp_path / "third")
 
 
 def test_round_trip_is_exact(tmp_path: Path):
