@@ -40,7 +40,10 @@ def to_run_config(composed: DictConfig, choices: Choices) -> tuple[RunConfig, Ch
         scene = replace(scene, name=derive_name(scene.path))
     choices = replace(choices, scene=scene.name)
     config = replace(config, scene=scene, paths=replace(config.paths, root=_absolute(config.paths.root)))
-    return replace(config, name=config.name or run_name(choices, config.seed)), choices
+    name = config.name or run_name(choices, config.seed)
+    if name != Path(name).name or name == "..":
+        raise RtgsError(f"config: name={name!r} is to be one folder in runs/: give a name without / that is not ..")
+    return replace(config, name=name), choices
 
 
 def _absolute(path: str) -> str:

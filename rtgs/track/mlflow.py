@@ -204,10 +204,11 @@ def _first_line(error: Exception) -> str:
 
 
 def _quiet() -> None:
-    """No telemetry, no network; set before the first import of MLflow."""
+    """No telemetry, no network of its own, few retries; set before the first import of MLflow."""
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
     os.environ.setdefault("DO_NOT_TRACK", "true")
     os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")
+    os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "2")  # a server that is not there: seconds, not minutes
 
 
 def _quiet_logs() -> None:

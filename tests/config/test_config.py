@@ -110,6 +110,12 @@ def test_a_mistake_in_a_file_names_file_and_key(conf_copy, group, content, expec
         assert part in text
 
 
+@pytest.mark.parametrize("name", ["../elsewhere", "a/b", "..", "/tmp/run"])
+def test_a_run_stays_in_its_folder(name):
+    with pytest.raises(RtgsError, match="one folder in runs/"):
+        compose([f"name={name}"])
+
+
 def test_a_missing_folder_of_photos_is_asked_for():
     assert "scene.path is empty" in message("scene=capture")
 

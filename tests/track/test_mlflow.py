@@ -138,6 +138,16 @@ def test_a_database_that_cannot_be_used_says_so(tmp_path):
         pass
 
 
+def test_a_server_that_is_not_there_says_so_soon(tmp_path):
+    code = (
+        "import sys; from pathlib import Path; from rtgs.track.mlflow import MlflowTracking;"
+        "MlflowTracking(Path(sys.argv[1]), 'http://127.0.0.1:1').client"
+    )
+    process = subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True, timeout=90)
+    assert process.returncode == 1
+    assert "does not answer" in process.stderr
+
+
 def test_a_kill_while_the_database_is_made_leaves_nothing_in_the_way(tmp_path):
     killed = subprocess.run([sys.executable, "-c", KILLED_BY_A_MIGRATION + WRITER, str(tmp_path), "once"], timeout=120)
     assert killed.returncode == -signal.SIGKILL
