@@ -10,9 +10,9 @@ from torch.autograd.function import once_differentiable
 
 from rtgs.cameras import Camera
 from rtgs.native import core
+from rtgs.render.arguments import check_shapes
 from rtgs.render.buffers import RasterBuffers, RasterOptions
 
-MAX_CHANNELS = 32
 MAX_SIDE = 1 << 18  # tile numbers are 16-bit
 _DEFAULT_OPTIONS = RasterOptions()
 
@@ -49,7 +49,17 @@ def rasterize_surfels(
     Raises:
         ValueError: a shape, a dtype or an option does not fit; the message names the argument.
     """
-    _check_tensors(means, tangent_u, tangent_v, scales, opacities, features, background, screen_probe)
+    check_shapes(means, tangent_u, tangent_v, scales, opacities, features, background, screen_probe)
+    _check_dtypes(
+        means=means,
+        tangent_u=tangent_u,
+        tangent_v=tangent_v,
+        scales=scales,
+        opacities=opacities,
+        features=features,
+        background=background,
+        screen_probe=screen_probe,
+    )
     _check_options(options, camera)
     if background is not None:
         background = background.detach().contiguous()
@@ -148,36 +158,9 @@ class _Rasterize(torch.autograd.Function):
         return (*gradients, None)
 
 
-def _check_tensors(
-    means: Tensor,
-    tangent_u: Tensor,
-    tangent_v: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    features: Tensor,
-    background: Tensor | None,
-    screen_probe: Tensor | None,
-) -> None:
-    channels = features.shape[1] if features.ndim == 2 else 0
-    if not 1 <= channels <= MAX_CHANNELS:
-        raise ValueError(f"features must be (N, C) with 1 <= C <= {MAX_CHANNELS}, got {tuple(features.shape)}")
-    count = means.shape[0] if means.ndim else 0
-    expected = {
-        "means": (means, (count, 3)),
-        "tangent_u": (tangent_u, (count, 3)),
-        "tangent_v": (tangent_v, (count, 3)),
-        "scales": (scales, (count, 2)),
-        "opacities": (opacities, (count,)),
-        "features": (features, (count, channels)),
-        "background": (background, (channels,)),
-        "screen_probe": (screen_probe, (count, 2)),
-    }
-    for name, (tensor, shape) in expected.items():
-        if tensor is None:
-            continue
-        if tuple(tensor.shape) != shape:
-            raise ValueError(f"{name} must have shape {shape} to fit means and features, got {tuple(tensor.shape)}")
-        if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
+def _check_dtypes(**tensors: Tensor | None) -> None:
+    for name, tensor in tensors.items():
+        if tensor is not None and (tensor.dtype != torch.float32 or tensor.device.type != "cpu"):
             raise ValueError(
                 f"{name} must be float32 on the CPU, got {tensor.dtype} on {tensor.device}; "
                 "convert it, or use rtgs.render.reference for float64"

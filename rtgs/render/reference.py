@@ -20,13 +20,13 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from rtgs.cameras import Camera
+from rtgs.render.arguments import check_shapes
 from rtgs.render.buffers import RasterBuffers, RasterOptions
 
 ALPHA_CUT = 1 / 255  # a contribution below it is skipped (Kerbl et al. 2023; methods.md 3.1)
 ALPHA_MAX = 0.99  # keeps 1 / (1 - alpha) <= 100 (methods.md 14)
 TRANSMITTANCE_CUT = 1e-4  # a pixel stops after the surfel that takes it below
 MEDIAN_TRANSMITTANCE = 0.5
-MAX_CHANNELS = 32
 DEFAULT_OPTIONS = RasterOptions()
 PAIRS_PER_CHUNK = 1 << 20  # surfel-pixel pairs evaluated at once: bounds memory
 
@@ -117,36 +117,6 @@ def rasterize_surfels(
         distortion=distortion if options.distortion else None,
         weight_sum=weight_sum if options.weight_sum else None,
     )
-
-
-def check_shapes(
-    means: Tensor,
-    tangent_u: Tensor,
-    tangent_v: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    features: Tensor,
-    background: Tensor | None,
-    screen_probe: Tensor | None,
-) -> None:
-    """Raise ValueError, naming the tensor, when a shape does not fit N surfels and C channels."""
-    count = means.shape[0]
-    channels = features.shape[1] if features.ndim == 2 else 0
-    if not 1 <= channels <= MAX_CHANNELS:
-        raise ValueError(f"features must be (N, C) with 1 <= C <= {MAX_CHANNELS}, got {tuple(features.shape)}")
-    expected = {
-        "means": (means, (count, 3)),
-        "tangent_u": (tangent_u, (count, 3)),
-        "tangent_v": (tangent_v, (count, 3)),
-        "scales": (scales, (count, 2)),
-        "opacities": (opacities, (count,)),
-        "features": (features, (count, channels)),
-        "background": (background, (channels,)),
-        "screen_probe": (screen_probe, (count, 2)),
-    }
-    for name, (tensor, shape) in expected.items():
-        if tensor is not None and tuple(tensor.shape) != shape:
-            raise ValueError(f"{name} must have shape {shape} to fit means and features, got {tuple(tensor.shape)}")
 
 
 def attach_probe(local: Tensor, probe: Tensor, camera: Camera) -> Tensor:
