@@ -191,9 +191,19 @@ def load_view(view: CaptureView, settings: SceneSettings) -> View:
 def _camera(view: CaptureView, pinhole: Lens) -> Camera:
     fx, fy, cx, cy = pinhole.params
     left, _, right = np.linalg.svd(view.rotation)  # poses from text files are rotations to a few digits only
-    rotation = torch.from_numpy(left @ right)
-    translation = torch.from_numpy(np.array(view.translation))
-    return Camera(rotation, translation, fx, fy, cx, cy, pinhole.width, pinhole.height, name=view.name)
+    rotation = left @ right
+    translation = rotation @ np.linalg.solve(view.rotation, view.translation)  # the camera stays where it was
+    return Camera(
+        torch.from_numpy(rotation),
+        torch.from_numpy(translation),
+        fx,
+        fy,
+        cx,
+        cy,
+        pinhole.width,
+        pinhole.height,
+        name=view.name,
+    )
 
 
 def _load_mask(view: CaptureView, lens: Lens, width: int, height: int) -> Tensor:

@@ -139,6 +139,13 @@ def test_cap_removes_the_lowest_weights_and_children_inherit_theirs():
     assert_in_step(surfels, adam, [1, 3, 5], [5])
 
 
+def test_the_cap_weighs_the_children_of_a_split_like_their_own_parent():
+    surfels, adam = scene([LARGE, LARGE, SMALL])
+    report = run(surfels, adam, control_of([HOT, HOT, COLD], [1, 5, 3], max_surfels=3, cap_share=1.0))
+    assert report == DensityReport(cloned=0, split=2, pruned=2, total=3)
+    assert_in_step(surfels, adam, [3], [2, 2])
+
+
 def test_at_the_cap_only_the_highest_signals_grow():
     """A cap of 4, exceeded by one: of three hot surfels the hottest is cloned, then the lowest weight goes."""
     surfels, adam = scene([SMALL] * 4)

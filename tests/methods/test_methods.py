@@ -12,6 +12,7 @@ from rtgs.errors import RtgsError
 from rtgs.methods import METHOD_NAMES, RenderOptions, Stage, create_method, method_stages
 from rtgs.methods import surfel_base as module
 from rtgs.render.buffers import RasterOptions
+from rtgs.train import losses
 from rtgs.train.seeds import generator_for
 from rtgs.train.settings import DensitySettings, LossSettings, MethodSettings, RenderSettings
 
@@ -146,6 +147,41 @@ def test_every_loss_that_is_on_is_computed_and_weighted():
     weighted = sum(term.weight * term.value for term in terms.terms)
     assert float(terms.total.detach()) == pytest.approx(weighted, rel=1e-5)
     assert method.decisions == ()
+
+
+@pytest.mark.parametrize("inverse", [False, True])
+@pytest.mark.parametrize("form", ["cosine", "envgs"])
+def test_geometric_terms_are_those_of_the_settings(inverse: bool, form: str):
+    loss = LossSettings(
+        normal_start=0, normal_inverse_depth=inverse, mono_normal=0.01, mono_normal_form=form, distortion=0.0
+    )
+    method, scene = make(replace(small_method(), loss=loss), normals=True)
+    view = scene.train[0]
+    rendered = method.render(view.camera, 0)
+    values = {term.name: term.value for term in method.losses(rendered, view, 0).terms}
+    maps = rendered.buffers
+    depth, normal = maps.depth, maps.normal
+    assert depth is not None
+    assert normal is not None
+    assert view.normal is not None
+    geometry = losses.normal_consistency_loss(normal, depth, maps.alpha, view.camera, inverse_depth_weight=inverse)
+    weight = losses.inverse_depth_weights(depth, maps.alpha) if inverse else None
+    mono = losses.mono_normal_loss(normal, view.normal, view.camera, form=form, weight=weight)
+    assert values["normal"] == float(geometry.detach())
+    assert values["mono_normal"] == float(mono.detach())
+
+
+def test_the_background_and_the_degree_of_the_step_are_those_of_the_settings():
+    settings = replace(small_method(), render=RenderSettings(background=(0.2, 0.4, 0.6)))
+    method, scene = make(settings)
+    train_step(method, scene, 0)
+    assert method.sets[0].optimizer.sh_degree == 0
+    train_step(method, scene, 40)
+    assert method.sets[0].optimizer.sh_degree == 2
+    with torch.no_grad():
+        method.sets[0].surfels.opacity_logits.fill_(-9)
+        image = method.render(scene.test[0].camera, 41, RenderOptions()).image
+    assert torch.equal(image, torch.tensor([0.2, 0.4, 0.6])[:, None, None].expand_as(image))
 
 
 def test_without_normals_there_is_no_mono_loss_and_the_report_says_why():

@@ -129,6 +129,13 @@ def test_no_gradient_is_tracked_without_leaves():
     assert buffers.weight_sum is not None
 
 
+def test_the_weight_sum_is_no_part_of_the_graph():
+    scene = native_scene(60, 30, 20, 3)
+    weight_sum = scene.render(SCENE_OPTIONS, scene.leaves()).weight_sum
+    assert weight_sum is not None
+    assert not weight_sum.requires_grad
+
+
 def test_weight_sum_adds_up_to_alpha(isa: str):
     buffers = native_scene(500, 70, 50, 3).render(SCENE_OPTIONS)
     assert buffers.weight_sum is not None

@@ -46,6 +46,24 @@ def test_opengl_poses_become_world_to_camera(tmp_path):
     np.testing.assert_allclose(pixel.numpy(), PINHOLE[2:], atol=1e-9)
 
 
+def test_poses_of_three_digits_become_rotations_about_the_same_camera_centre(tmp_path):
+    root = write_transforms(tmp_path)
+
+    def rounded(content):
+        for frame in content["frames"]:
+            matrix = np.array(frame["transform_matrix"])
+            matrix[:3, :3] = matrix[:3, :3].round(3)
+            frame["transform_matrix"] = matrix.tolist()
+
+    edit_transforms(root, rounded)
+    content = json.loads((root / "transforms.json").read_text())
+    centers = {frame["file_path"]: np.array(frame["transform_matrix"])[:3, 3] for frame in content["frames"]}
+    for view in load(root).train:
+        rotation = view.camera.rotation.numpy()
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+        np.testing.assert_allclose(view.camera.center.numpy(), centers[view.name], atol=1e-12)
+
+
 def test_frames_override_and_missing_keys_have_defaults(tmp_path):
     root = write_transforms(tmp_path, fl_x=None, fl_y=None, cx=None, cy=None, w=None, h=None, camera_angle_x=1.0)
     edit_transforms(root, lambda content: content["frames"][1].update(fl_x=70.0, cy=20.0))

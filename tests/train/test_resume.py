@@ -118,6 +118,25 @@ def test_killed_while_writing_a_checkpoint(tmp_path: Path, uninterrupted, die_at
     assert not list(tmp_path.glob(".writing_*"))
 
 
+def test_the_numbers_shown_to_the_user_go_on_too(tmp_path: Path):
+    straight = small_trainer(schedule=small_schedule(TOTAL)).run()
+    trainer = small_trainer(schedule=small_schedule(TOTAL), checkpoint_dir=tmp_path)
+    after_step = trainer.method.after_step
+
+    def interrupted(step: int):
+        if step == 40:
+            raise KeyboardInterrupt
+        return after_step(step)
+
+    trainer.method.after_step = interrupted  # type: ignore[method-assign]
+    with pytest.raises(KeyboardInterrupt):
+        trainer.run()
+    resumed = small_trainer(schedule=small_schedule(TOTAL), checkpoint_dir=tmp_path).run()
+    assert resumed.resumed_from == 30
+    assert (resumed.loss, resumed.psnr_train) == (straight.loss, straight.psnr_train)
+    assert resumed.psnr_test == straight.psnr_test
+
+
 def test_a_truncated_newest_checkpoint_costs_time_but_not_exactness(tmp_path: Path, uninterrupted):
     small_trainer(schedule=small_schedule(TOTAL), checkpoint_dir=tmp_path).run()
     newest = checkpoint_path(tmp_path, TOTAL) / "state.safetensors"
