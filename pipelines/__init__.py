@@ -1,1 +1,4 @@
-"""The steps from photos to a report, one file each; :mod:`pipelines.graph` joins them, ``pipelines.run`` runs them."""
+"""The steps from photos to a report, one file each.
+
+:mod:`pipelines.graph` joins them, :mod:`pipelines.app` runs them, :mod:`pipelines.cli` is the command line.
+"""

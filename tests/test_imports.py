@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import subprocess
 import sys
 from pathlib import Path
@@ -37,7 +38,18 @@ def test_the_core_imports_no_tool():
     assert result.stdout.strip() == "[]"
 
 
-@pytest.mark.parametrize("name", ["rtgs.cli", "rtgs.pipeline", "rtgs.track"])
+def test_the_library_does_not_reach_up_into_the_pipelines():
+    """Only ``python -m rtgs``, a door to the command line, does."""
+    reaching = []
+    for path in sorted(ROOT.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            reaching += [path.relative_to(ROOT).as_posix() for name in names if name.split(".")[0] == "pipelines"]
+    assert reaching == ["__main__.py"]
+
+
+@pytest.mark.parametrize("name", ["pipelines.cli", "pipelines.run", "rtgs.pipeline", "rtgs.track"])
 def test_what_starts_quickly_imports_no_heavy_library(name):
     heavy = {"torch", "mlflow", "hydra", "pycolmap", "open3d", "matplotlib", "cv2"}
     code = f"import sys, {name}; print(sorted({{m.split('.')[0] for m in sys.modules}} & {heavy!r}))"

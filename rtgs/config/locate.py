@@ -5,19 +5,18 @@ from __future__ import annotations
 from functools import cache
 from pathlib import Path
 
+import rtgs
 from rtgs.errors import RtgsError
 
 
 @cache
 def project_root() -> Path:
-    """The folder that holds ``conf/`` and ``pipelines/``.
+    """The folder that holds ``rtgs/``, ``pipelines/`` and ``conf/``.
 
     Raises:
         RtgsError: the installation lacks them.
     """
-    import pipelines
-
-    root = Path(pipelines.__path__[0]).resolve().parent
+    root = Path(rtgs.__file__).resolve().parents[1]
     if not (root / "conf" / "config.yaml").is_file():
         raise RtgsError(f"{root / 'conf' / 'config.yaml'} is missing: install rtgs again")
     return root

@@ -114,7 +114,7 @@ def _raised_in_project(trace: TracebackType | None) -> bool:
 
 def run(words: list[str]) -> int:
     """``rtgs run``: everything after it goes to Hydra."""
-    from pipelines.run import run_hydra
+    from pipelines.app import run_hydra
 
     run_hydra(words)
     return 0
@@ -125,9 +125,9 @@ def plan(words: list[str]) -> int:
     if words[:1] in (["-h"], ["--help"]):
         print("rtgs plan [group=choice] [key=value]\n\nThe words of `rtgs run`; prints the plan and runs nothing.")
         return 0
+    from pipelines.app import describe, friendly_overrides
     from pipelines.graph import build_graph
     from pipelines.results import plan_rows
-    from pipelines.run import describe, friendly_overrides
     from rtgs.config import compose
     from rtgs.pipeline import Store, make_plan
 
@@ -191,7 +191,7 @@ def check(words: list[str]) -> int:
         print("rtgs check FOLDER | scene=NAME [scene.key=value]\n")
         print("Lists what is wrong with a capture; reads every photo, mask and normal map.")
         return 0 if words else 2
-    from pipelines.run import friendly_overrides
+    from pipelines.app import friendly_overrides
     from rtgs.config import compose
     from rtgs.scenes.check import check_capture
 

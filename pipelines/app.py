@@ -1,0 +1,205 @@
+"""What ``rtgs run`` does: compose a config, plan, run what is missing, show the result."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from collections.abc import Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from omegaconf import DictConfig
+
+from rtgs.config.compose import VERSION_BASE, choices_from
+from rtgs.config.convert import to_run_config
+from rtgs.config.locate import choices_of, conf_dir
+from rtgs.config.schema import Choices, RunConfig, register_schema
+from rtgs.errors import RtgsError
+from rtgs.pipeline import InlineExecutor, Plan, StepResult, Store, make_plan
+from rtgs.track import open_tracking
+
+log = logging.getLogger("rtgs")
+
+
+@dataclass(frozen=True)
+class RunOutcome:
+    """What a run gave."""
+
+    plan: Plan
+    results: tuple[StepResult, ...]
+    folder: Path
+
+
+def execute(config: RunConfig, choices: Choices) -> RunOutcome:
+    """Plan the run, execute what the store lacks, write the run folder, print the table.
+
+    Raises:
+        StepFailed: a step raised.
+        CaptureError: the capture cannot be read.
+    """
+    from pipelines.graph import build_graph, command
+
+    _set_threads(config.threads)
+    store = Store(config.paths.store)
+    plan = make_plan(build_graph(config, choices).targets, store)
+    log.info("%s", describe(plan))
+    results, folder = _run(config, choices, store, plan, command(choices))
+    _show(results, folder)
+    return RunOutcome(plan, results, folder)
+
+
+def _run(
+    config: RunConfig, choices: Choices, store: Store, plan: Plan, command: str
+) -> tuple[tuple[StepResult, ...], Path]:
+    from pipelines.results import run_info, track_end, track_start, write_run_folder
+
+    if plan.complete:  # nothing to record: the tracker saw this run when it was executed
+        results = InlineExecutor(store).execute(plan)
+        return results, write_run_folder(config, choices, command, results)
+    tracking = open_tracking(config.tracking.kind, Path(config.paths.root), config.tracking.uri)
+    with tracking.run(run_info(config, choices, plan)) as tracker:
+        track_start(tracker, config, plan)
+        results = InlineExecutor(store, tracking).execute(plan)
+        folder = write_run_folder(config, choices, command, results)
+        track_end(tracker, folder, results)
+    return results, folder
+
+
+def describe(plan: Plan) -> str:
+    """One line: how many steps, how many are cached."""
+    text = f"{len(plan)} steps, {plan.hits} from the cache"
+    return f"{text}, nothing to do" if plan.complete else text
+
+
+def _show(results: Sequence[StepResult], folder: Path) -> None:
+    from pipelines.report import PAGE
+    from pipelines.results import evaluation_of, result_table
+
+    print(f"\n{result_table([evaluation_of(results)])}\n\nreport: {_short(folder / PAGE)}")
+
+
+def _short(path: Path) -> str:
+    relative = os.path.relpath(path)
+    return str(path) if relative.startswith("..") else relative
+
+
+def _set_threads(threads: int | None) -> None:
+    if threads is None:
+        return
+    if threads < 1:
+        raise RtgsError(f"config: threads={threads} must be at least 1")
+    import torch
+
+    torch.set_num_threads(threads)
+
+
+def friendly_overrides(arguments: Sequence[str]) -> list[str]:
+    """Make a folder as good as a scene's name: ``scene=/my/capture`` or ``scene.path=/my/capture`` alone."""
+    rewritten: list[str] = []
+    for argument in arguments:
+        key, _, value = argument.partition("=")
+        plain = value.strip("'\"")
+        if key == "scene" and "," not in value and plain not in choices_of("scene") and _is_path(plain, arguments):
+            rewritten += ["scene=capture", f"scene.path={_quoted(plain)}"]
+        elif key == "scene.path" and not value.startswith(("'", '"')) and Path(value).expanduser().exists():
+            rewritten.append(f"scene.path={_quoted(value)}")
+        else:
+            rewritten.append(argument)
+    keys = {argument.partition("=")[0] for argument in rewritten}
+    if "scene.path" in keys and "scene" not in keys:
+        rewritten.append("scene=capture")
+    options = [argument for argument in rewritten if not _is_override(argument)]
+    return options + [argument for argument in rewritten if _is_override(argument)]  # argparse wants them in one piece
+
+
+def _is_path(text: str, arguments: Sequence[str]) -> bool:
+    """Whether a scene is a path: it exists, or looks like one (then the importer says that nothing is there)."""
+    own_files = any(argument.startswith(("--config-dir", "-cd")) for argument in arguments)  # may hold scene/group/name
+    return Path(text).expanduser().exists() or (not own_files and (os.sep in text or text.startswith(("~", "."))))
+
+
+def _is_override(argument: str) -> bool:
+    return argument.startswith("~") or ("=" in argument and not argument.startswith("-"))
+
+
+def _quoted(text: str) -> str:
+    escaped = text.replace("\\", "\\\\").replace("'", "\\'") if "'" in text else text
+    return f"'{escaped}'"
+
+
+class HydraApp:
+    """The task function behind Hydra.
+
+    Keeps the error of a single run, so that Hydra adds nothing to it, and the outcomes of a sweep in this process.
+    """
+
+    def __init__(self) -> None:
+        self.error: Exception | None = None
+        self.outcomes: list[RunOutcome] = []
+        self.failures: list[str] = []
+
+    def __call__(self, composed: DictConfig) -> None:
+        """One job."""
+        from hydra.core.hydra_config import HydraConfig
+        from hydra.types import RunMode
+
+        hydra = HydraConfig.get()
+        try:
+            config, choices = to_run_config(composed, choices_from(hydra.runtime.choices, hydra.overrides.task))
+            self.outcomes.append(execute(config, choices))
+        except Exception as error:
+            if hydra.mode == RunMode.MULTIRUN:
+                self.failures.append(f"job {hydra.job.num} ({hydra.job.override_dirname}): {error}")
+                log.error("%s", self.failures[-1])
+                raise
+            self.error = error
+
+    def summary(self) -> str:
+        """Table and failures of a sweep whose jobs ran in this process; empty otherwise."""
+        if len(self.outcomes) + len(self.failures) < 2:
+            return ""
+        from pipelines.results import evaluation_of, result_table
+
+        parts = [result_table([evaluation_of(outcome.results) for outcome in self.outcomes])] if self.outcomes else []
+        if self.failures:
+            total = len(self.outcomes) + len(self.failures)
+            parts.append("\n".join([f"{len(self.failures)} of {total} jobs failed:", *self.failures]))
+        return "\n\n".join(parts)
+
+
+def run_hydra(arguments: Sequence[str]) -> None:
+    """Compose and run; raises what the job raised."""
+    import hydra
+
+    register_schema()
+    app = HydraApp()
+
+    def task(composed: DictConfig) -> None:
+        app(composed)
+
+    decorated = hydra.main(version_base=VERSION_BASE, config_path=str(conf_dir()), config_name="config")(task)
+    try:
+        with _command_line(["rtgs run", *friendly_overrides(arguments)]):
+            decorated()
+    finally:
+        if text := app.summary():
+            print(f"\n{text}")
+    if app.error is not None:
+        raise app.error
+
+
+@contextmanager
+def _command_line(words: list[str]):
+    """Hydra reads ``sys.argv``, and hands errors on unformatted with ``HYDRA_FULL_ERROR``."""
+    saved, full = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
+    sys.argv, os.environ["HYDRA_FULL_ERROR"] = words, "1"
+    try:
+        yield
+    finally:
+        sys.argv = saved
+        if full is None:
+            del os.environ["HYDRA_FULL_ERROR"]
+        else:
+            os.environ["HYDRA_FULL_ERROR"] = full
