@@ -40,7 +40,7 @@ def import_scene(params: ImportParams, context: StepContext) -> None:
 
 STEP = StepKind(
     "import_scene",
-    1,
+    2,
     import_scene,
     helpers=(
         "rtgs.scenes.canonical",
