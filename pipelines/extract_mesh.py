@@ -104,5 +104,5 @@ STEP = StepKind(
     "extract_mesh",
     1,
     extract_mesh,
-    helpers=("pipelines.training", "rtgs.mesh.tsdf", "rtgs.mesh.triangles", "rtgs.methods.surfel_base"),
+    helpers=("pipelines.training", "rtgs.mesh.tsdf", "rtgs.mesh.triangles", "rtgs.methods.surfel_base", "rtgs.native"),
 )

@@ -90,5 +90,8 @@ def read_timed(folder: Path, view_name: str) -> TimedRender:
 
 
 STEP = StepKind(
-    "render", 1, render, helpers=("pipelines.training", "rtgs.methods.surfel_base", "rtgs.render.rasterize")
+    "render",
+    1,
+    render,
+    helpers=("pipelines.training", "rtgs.methods.surfel_base", "rtgs.render.rasterize", "rtgs.native"),
 )

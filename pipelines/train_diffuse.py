@@ -28,5 +28,6 @@ STEP = StepKind(
         "rtgs.gaussians.activate",
         "rtgs.gaussians.ply",
         "rtgs.render.rasterize",
+        "rtgs.native",
     ),
 )

@@ -10,6 +10,7 @@ import ast
 import hashlib
 import importlib.util
 import json
+import re
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -18,11 +19,19 @@ from rtgs.pipeline.step import StepKind
 
 
 def source_hash(kind: StepKind) -> str:
-    """SHA-256 over the module of ``kind.run`` and its helper modules; comments, blanks and docstrings do not count."""
+    """SHA-256 over the module of ``kind.run`` and its helper modules; comments, blanks and docstrings do not count.
+
+    A helper that is a package counts with the C++ sources beside its ``__init__``: ``rtgs.native`` is all kernels.
+    """
     digest = hashlib.sha256()
     for module in (kind.run.__module__, *kind.helpers):
         digest.update(module.encode())
-        digest.update(_normalised(_source(module, kind.name)).encode())
+        source = _source(module, kind.name)
+        digest.update(_normalised(source).encode())
+        if source.name == "__init__.py":
+            for native in sorted(path for path in source.parent.iterdir() if path.suffix in (".cpp", ".h")):
+                digest.update(native.name.encode())
+                digest.update(_normalised_native(native).encode())
     return digest.hexdigest()
 
 
@@ -43,6 +52,11 @@ def _normalised(path: Path) -> str:
             assert isinstance(body, list)
             body.pop(0)
     return ast.dump(tree)
+
+
+def _normalised_native(path: Path) -> str:
+    code = re.sub(r"//[^\n]*|/\*.*?\*/", " ", path.read_text(encoding="utf-8"), flags=re.DOTALL)
+    return " ".join(code.split())
 
 
 def check_sources(kinds: Iterable[StepKind], lock_file: Path) -> list[str]:

@@ -48,6 +48,24 @@ def test_a_change_of_the_step_or_its_helper_is_caught(kind, tmp_path, file):
     assert check_sources([], lock) == ["step guarded is gone: run `make accept-steps`"]
 
 
+def test_the_kernels_of_a_native_package_count_without_their_comments(kind, tmp_path):
+    package = tmp_path / "guarded_native"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    kernel = package / "kernel.cpp"
+    kernel.write_text("// One.\nfloat f() { return 1.f; }  /* two\n lines */\n")
+    native = replace(kind, helpers=("guarded_native",))
+    before = source_hash(native)
+    kernel.write_text("float f() {\n  return 1.f;\n}\n")
+    assert source_hash(native) == before
+    kernel.write_text("float f() { return 2.f; }")
+    assert source_hash(native) != before
+
+
+def test_training_rendering_and_meshing_depend_on_the_kernels():
+    assert {kind.name for kind in KINDS if "rtgs.native" in kind.helpers} >= {"train_diffuse", "render", "extract_mesh"}
+
+
 def test_a_helper_that_does_not_exist_is_named(kind):
     with pytest.raises(RtgsError, match=r"step guarded declares the helper module 'guarded_nothing'"):
         source_hash(replace(kind, helpers=("guarded_nothing",)))
