@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.graph import increment_version
 
 from rtgs.gaussians.harmonics import rest_count
 from rtgs.gaussians.surfels import Surfels
@@ -131,6 +132,7 @@ class SurfelAdam:
             entries.append(
                 (values.detach().numpy(), gradient.numpy(), first.numpy(), second.numpy(), active, step_size)
             )
+            increment_version(values)  # a graph that still needs the old values refuses its backward pass
         second_scale = 1 / math.sqrt(1 - s.beta2**self.steps)
         if core.adam_step(entries, s.beta1, s.beta2, s.eps, second_scale, torch.get_num_threads()):
             report = find_nonfinite((name, values.grad) for name, values in self.surfels.items())

@@ -94,6 +94,15 @@ def test_inactive_bands_are_skipped_exactly(isa):
         assert torch.equal(getattr(adams[0].second, name), getattr(adams[1].second, name)), name
 
 
+def test_a_graph_of_the_old_values_refuses_its_backward_pass():
+    surfels = surfels_of(3)
+    loss = surfels.means.square().sum()
+    loss.backward(retain_graph=True)
+    SurfelAdam(surfels, SETTINGS, extent=1.0).step(0)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        loss.backward()
+
+
 def test_bands_once_active_stay_active():
     surfels, twin = surfels_of(5), surfels_of(5)
     adams = [SurfelAdam(s, SETTINGS, extent=1.0) for s in (surfels, twin)]
