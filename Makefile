@@ -40,6 +40,7 @@ bench: setup ## speed and error figures, each a JSON object on its last line
 	$(BIN)/python -m benchmarks.losses
 	$(BIN)/python -m benchmarks.gaussians
 	$(BIN)/python -m benchmarks.train_step
+	$(BIN)/python -m benchmarks.speed_error --quick
 
 lint: setup ## ruff and pyright
 	$(BIN)/ruff check .
