@@ -40,7 +40,9 @@ def execute(config: RunConfig, choices: Choices) -> RunOutcome:
         CaptureError: the capture cannot be read.
     """
     from pipelines.graph import build_graph, command
+    from rtgs.native import core
 
+    core.isa()  # an instruction set that RTGS_ISA misspells, or that this CPU lacks, stops here and not in training
     _set_threads(config.threads)
     store = Store(config.paths.store)
     plan = make_plan(build_graph(config, choices).targets, store)

@@ -5,7 +5,20 @@ Steps count from 0. A stage boundary "from" is the first step at which something
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass, field, fields
+
+
+def _refuse_bad_numbers(settings: object, where: str) -> None:
+    """Every float of a settings object must be finite and not negative, every ``*_start`` a share."""
+    for entry in fields(settings):  # type: ignore[arg-type]
+        value = getattr(settings, entry.name)
+        if not isinstance(value, float):
+            continue
+        largest = 1.0 if entry.name.endswith("_start") else math.inf
+        if not (0 <= value <= largest and math.isfinite(value)):
+            allowed = "between 0 and 1" if largest == 1 else "a finite number of at least 0"
+            raise ValueError(f"{where}.{entry.name}={value} must be {allowed}")
 
 
 @dataclass(frozen=True)
@@ -27,6 +40,9 @@ class OptimizerSettings:
     smallest_scale: float = 1e-6  # times the scene extent
     largest_scale: float = 100.0  # times the scene extent
 
+    def __post_init__(self) -> None:
+        _refuse_bad_numbers(self, "method.optimizer")
+
 
 @dataclass(frozen=True)
 class LossSettings:
@@ -46,6 +62,9 @@ class LossSettings:
     mono_normal_form: str = "cosine"  # "cosine" (paper: 1 - n.N) or "envgs" (|difference|_1 + 1 - cos)
     distortion: float = 0.0  # 2DGS: 0 unbounded, 1000 bounded
     distortion_start: float = 0.1  # 2DGS: from 3,000 of 30,000
+
+    def __post_init__(self) -> None:
+        _refuse_bad_numbers(self, "method.loss")
 
 
 @dataclass(frozen=True)
