@@ -1,7 +1,7 @@
 """The C++ core: kernels for AVX-512, AVX2 and a portable path, chosen at run time or by ``RTGS_ISA``."""
 
 try:
-    from rtgs.native import _core as core
+    from rtgs.native import _core as core  # pyright: ignore[reportMissingModuleSource]
 except ImportError as error:
     raise ImportError(
         f"the native core of rtgs is not built or does not load ({error}). Run `make setup` in the repository "
