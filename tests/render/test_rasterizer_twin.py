@@ -1,9 +1,8 @@
 """The native rasteriser against its twin: hypothesis-drawn scenes, errors pooled over all examples of a test.
 
 Ordinary scenes: pictures within 1e-5 of their maximum on all but 1e-3 of the pixels, gradients within 1e-4 of their
-largest element. Degenerate scenes: the larger of these and four times the error of the twin itself run in float32, for
-gradients on all but 1e-2 of the elements; the maximum hangs on the one gradient that nearly vanishes, and is given more
-room. Pixels on a discontinuity are flagged, counted, and given no upstream gradient.
+largest element. Degenerate scenes: the larger of these and four times the error of the twin itself run in float32; for
+three ill-conditioned kinds that holds for all but 1e-2 of the gradient elements, and the largest has more room. Pixels on a discontinuity are flagged, counted, and given no upstream gradient.
 """
 
 import pytest
@@ -19,7 +18,9 @@ PIXEL_TOLERANCE, PIXEL_SHARE = 1e-5, 1e-3
 GRADIENT_TOLERANCE = 1e-4
 SLACK = 4.0  # of degenerate scenes, over the twin in float32
 GRADIENT_SHARE = 1e-2  # of degenerate scenes: elements that may go beyond
-GROSS_TOLERANCE, GROSS_SLACK = 1e-3, 16.0  # for those
+# Known shortfall: their largest gradient error exceeds four times that of the twin in float32 (5.6x, 8x, 34x measured).
+ILL_CONDITIONED = ("edge-on", "needle", "huge")
+GROSS_TOLERANCE, GROSS_SLACK = 1e-3, 16.0  # for the largest gradient of those
 
 
 def pool_examples(kind: str, examples: int, *, with_twin: bool = False) -> tuple[Pools, Pools]:
@@ -59,7 +60,8 @@ def test_degenerate_scenes(isa: str, kind: str):
     for name, pool in pools.gradients.items():
         allowed = max(GRADIENT_TOLERANCE, SLACK * twin.gradients[name].beyond_share(GRADIENT_SHARE))
         assert pool.beyond_share(GRADIENT_SHARE) <= allowed, name
-        assert pool.worst <= max(GROSS_TOLERANCE, GROSS_SLACK * twin.gradients[name].worst), name
+        slack, tolerance = (GROSS_SLACK, GROSS_TOLERANCE) if kind in ILL_CONDITIONED else (SLACK, GRADIENT_TOLERANCE)
+        assert pool.worst <= max(tolerance, slack * twin.gradients[name].worst), name
 
 
 def test_crowded_picture(isa: str):
