@@ -2,7 +2,8 @@
 
 Ordinary scenes: pictures within 1e-5 of their maximum on all but 1e-3 of the pixels, gradients within 1e-4 of their
 largest element. Degenerate scenes: the larger of these and four times the error of the twin itself run in float32; for
-three ill-conditioned kinds that holds for all but 1e-2 of the gradient elements, and the largest has more room. Pixels on a discontinuity are flagged, counted, and given no upstream gradient.
+three ill-conditioned kinds that holds for all but 1e-2 of the gradient elements, and the largest has more room. Pixels
+on a discontinuity are flagged, counted, and given no upstream gradient.
 """
 
 import pytest
