@@ -17,7 +17,7 @@ from rtgs.config.convert import to_run_config
 from rtgs.config.locate import choices_of, conf_dir
 from rtgs.config.schema import Choices, RunConfig, register_schema
 from rtgs.errors import RtgsError
-from rtgs.pipeline import InlineExecutor, Plan, StepResult, Store, make_plan
+from rtgs.pipeline import InlineExecutor, Plan, RemoteStore, StepResult, Store, make_plan
 from rtgs.track import open_tracking
 
 log = logging.getLogger("rtgs")
@@ -30,6 +30,21 @@ class RunOutcome:
     plan: Plan
     results: tuple[StepResult, ...]
     folder: Path
+
+
+@dataclass(frozen=True)
+class _Stores:
+    local: Store
+    remote: RemoteStore | None
+
+
+def remote_store(config: RunConfig) -> RemoteStore | None:
+    """The store shared with other machines, if the config names one.
+
+    Raises:
+        RemoteStoreError: its URL cannot be opened.
+    """
+    return RemoteStore(config.paths.remote) if config.paths.remote else None
 
 
 def execute(config: RunConfig, choices: Choices) -> RunOutcome:
@@ -45,25 +60,26 @@ def execute(config: RunConfig, choices: Choices) -> RunOutcome:
     core.isa()  # an instruction set that RTGS_ISA misspells, or that this CPU lacks, stops here and not in training
     _set_threads(config.threads)
     store = Store(config.paths.store)
-    plan = make_plan(build_graph(config, choices).targets, store)
+    remote = remote_store(config)
+    plan = make_plan(build_graph(config, choices).targets, store, remote)
     log.info("%s", describe(plan))
-    results, folder = _run(config, choices, store, plan, command(choices))
+    results, folder = _run(config, choices, _Stores(store, remote), plan, command(choices))
     _show(results, folder)
     return RunOutcome(plan, results, folder)
 
 
 def _run(
-    config: RunConfig, choices: Choices, store: Store, plan: Plan, command: str
+    config: RunConfig, choices: Choices, stores: _Stores, plan: Plan, command: str
 ) -> tuple[tuple[StepResult, ...], Path]:
     from pipelines.results import run_info, track_end, track_start, write_run_folder
 
     if plan.complete:  # nothing to record: the tracker saw this run when it was executed
-        results = InlineExecutor(store).execute(plan)
+        results = InlineExecutor(stores.local).execute(plan)
         return results, write_run_folder(config, choices, command, results)
     tracking = open_tracking(config.tracking.kind, Path(config.paths.root), config.tracking.uri)
     with tracking.run(run_info(config, choices, plan)) as tracker:
         track_start(tracker, config, plan)
-        results = InlineExecutor(store, tracking).execute(plan)
+        results = InlineExecutor(stores.local, tracking, stores.remote).execute(plan)
         folder = write_run_folder(config, choices, command, results)
         track_end(tracker, folder, results)
     return results, folder
@@ -72,6 +88,8 @@ def _run(
 def describe(plan: Plan) -> str:
     """One line: how many steps, how many are cached."""
     text = f"{len(plan)} steps, {plan.hits} from the cache"
+    if fetched := sum(planned.remote for planned in plan):
+        text += f", {fetched} from the remote store"
     return f"{text}, nothing to do" if plan.complete else text
 
 

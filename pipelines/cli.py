@@ -11,13 +11,9 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING
 
 from rtgs import __version__
 from rtgs.errors import RtgsError
-
-if TYPE_CHECKING:
-    from rtgs.pipeline import Store
 
 USAGE = f"""rtgs {__version__}: Gaussian models of scenes with glass and mirrors, on the CPU
 
@@ -25,7 +21,7 @@ USAGE = f"""rtgs {__version__}: Gaussian models of scenes with glass and mirrors
   rtgs plan [group=choice] [key=value]    what `rtgs run` with the same words would do, and why
   rtgs check FOLDER | scene=NAME          what is wrong with a capture, before any training
   rtgs report [RUN]                       where the report of the latest (or the named) run is
-  rtgs cache ls | gc | verify             the artifact store
+  rtgs cache ls|gc|verify|push|pull       the artifact store, and the one that machines share
   rtgs weights                            pretrained files: what is known, what is there; downloads nothing
   rtgs dashboard                          MLflow's pages on this machine
 
@@ -125,64 +121,26 @@ def plan(words: list[str]) -> int:
     if words[:1] in (["-h"], ["--help"]):
         print("rtgs plan [group=choice] [key=value]\n\nThe words of `rtgs run`; prints the plan and runs nothing.")
         return 0
-    from pipelines.app import describe, friendly_overrides
+    from pipelines.app import describe, friendly_overrides, remote_store
+    from pipelines.cache import columns
     from pipelines.graph import build_graph
     from pipelines.results import plan_rows
     from rtgs.config import compose
     from rtgs.pipeline import Store, make_plan
 
     config, choices = compose(friendly_overrides(words))
-    planned = make_plan(build_graph(config, choices).targets, Store(config.paths.store))
+    planned = make_plan(build_graph(config, choices).targets, Store(config.paths.store), remote_store(config))
     rows = [("step", "key", "state", "why"), *(tuple(row.values()) for row in plan_rows(planned))]
-    print(_columns(rows))
+    print(columns(rows))
     print(f"\n{describe(planned)}")
     return 0
 
 
 def cache(words: list[str]) -> int:
-    """``rtgs cache ls | gc | verify``."""
-    from rtgs.pipeline import Store
+    """``rtgs cache ls | gc | verify | push | pull``."""
+    from pipelines.cache import main as run_cache
 
-    parser = argparse.ArgumentParser("rtgs cache", description="The artifact store.")
-    parser.add_argument("action", choices=("ls", "gc", "verify"), help="list, remove garbage, check every digest")
-    parser.add_argument("--root", type=Path, default=_root(), help="folder that holds store/ (default: %(default)s)")
-    parser.add_argument("--partial", action="store_true", help="gc: also checkpoints of unfinished steps")
-    parser.add_argument("--older-than", type=float, metavar="DAYS", help="gc: also artifacts made before that")
-    options = parser.parse_args(words)
-    store = Store(options.root / "store")
-    if options.action == "ls":
-        return _list(store)
-    if options.action == "verify":
-        return _verify(store)
-    removed = store.collect_garbage(partial=options.partial, older_than=options.older_than)
-    print(f"removed {len(removed.paths)} folders, {removed.size / 1e6:.1f} MB")
-    return 0
-
-
-def _list(store: Store) -> int:
-    artifacts = sorted(store.artifacts(), key=lambda artifact: artifact.manifest.created)
-    rows = [("step", "key", "made", "took", "size")]
-    for artifact in artifacts:
-        manifest = artifact.manifest
-        size, took = f"{manifest.size / 1e6:.1f} MB", f"{manifest.duration:.1f} s"
-        rows.append((manifest.step, manifest.fingerprint[:12], manifest.created, took, size))
-    print(_columns(rows))
-    total = sum(artifact.manifest.size for artifact in artifacts)
-    print(f"\n{len(artifacts)} artifacts, {total / 1e6:.1f} MB in {store.root}")
-    return 0
-
-
-def _verify(store: Store) -> int:
-    count, broken = 0, 0
-    for artifact, defects in store.verify():
-        count += 1
-        if defects:
-            broken += 1
-            print(f"{artifact.folder}\n" + "\n".join(f"  {defect}" for defect in defects))
-    print(
-        f"{count} artifacts, {count - broken} sound" + (f", {broken} damaged: delete their folders" if broken else "")
-    )
-    return 1 if broken else 0
+    return run_cache(words, _root())
 
 
 def check(words: list[str]) -> int:
@@ -281,11 +239,6 @@ def dashboard(words: list[str]) -> int:
 
 def _root() -> Path:
     return Path(os.environ.get("RTGS_ROOT", "."))
-
-
-def _columns(rows: Sequence[Sequence[str]]) -> str:
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    return "\n".join("  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip() for row in rows)
 
 
 COMMANDS: dict[str, Callable[[list[str]], int]] = {

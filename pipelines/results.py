@@ -208,7 +208,7 @@ def plan_rows(plan: Plan) -> list[Mapping[str, str]]:
         {
             "step": planned.step.name,
             "key": planned.step.fingerprint[:12],
-            "state": "cached" if planned.hit else "to run",
+            "state": "cached" if planned.hit else "to fetch" if planned.remote else "to run",
             "why": planned.reason,
         }
         for planned in plan

@@ -21,6 +21,11 @@ class PathsConfig:
     """Where results go: ``<root>/store`` (cached artifacts), ``<root>/runs`` (results), tracking and logs beside."""
 
     root: str = "."
+    remote: str = ""
+    """A store that machines share (``s3://bucket/path``, any URL of fsspec).
+
+    Looked into before a step is run, and given what was run. Empty: none.
+    """
 
     @property
     def store(self) -> Path:

@@ -2,7 +2,8 @@
 
 from rtgs.pipeline.executors import Executor, InlineExecutor, StepResult
 from rtgs.pipeline.fingerprint import NOT_IN_RECIPE
-from rtgs.pipeline.plan import Plan, PlannedStep, make_plan
+from rtgs.pipeline.plan import Plan, PlannedStep, make_plan, topological
+from rtgs.pipeline.remote import RemoteStore, RemoteStoreError
 from rtgs.pipeline.step import Step, StepContext, StepFailed, StepKind
 from rtgs.pipeline.store import Artifact, Store
 
@@ -13,6 +14,8 @@ __all__ = [
     "InlineExecutor",
     "Plan",
     "PlannedStep",
+    "RemoteStore",
+    "RemoteStoreError",
     "Step",
     "StepContext",
     "StepFailed",
@@ -20,4 +23,5 @@ __all__ = [
     "StepResult",
     "Store",
     "make_plan",
+    "topological",
 ]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import shutil
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,6 +14,7 @@ from filelock import Timeout
 
 from rtgs.pipeline.fingerprint import flatten
 from rtgs.pipeline.plan import Plan
+from rtgs.pipeline.remote import RemoteStore, RemoteStoreError
 from rtgs.pipeline.step import Step, StepContext, StepFailed
 from rtgs.pipeline.store import Artifact, Store
 from rtgs.track import NullTracking, RunInfo, Tracking
@@ -44,9 +44,11 @@ class Executor(Protocol):
 class InlineExecutor:
     """Steps in order, in this process; the store's locks keep other processes from doing the same work twice."""
 
-    def __init__(self, store: Store, tracking: Tracking | None = None) -> None:
+    def __init__(self, store: Store, tracking: Tracking | None = None, remote: RemoteStore | None = None) -> None:
+        """``remote``: looked into before a step is run, and given what was run."""
         self.store = store
         self.tracking = tracking or NullTracking()
+        self.remote = remote
 
     def execute(self, plan: Plan) -> tuple[StepResult, ...]:
         """Bring every step of the plan into the store.
@@ -68,10 +70,23 @@ class InlineExecutor:
             if artifact := self.store.find(step):
                 log.info("%s %s was made by another process", position, step.label)
                 return _result(step, artifact, executed=False)
+            if self.remote and (artifact := self.remote.fetch(step.name, step.fingerprint, self.store)):
+                log.info("%s %s from %s", position, step.label, self.remote.url)
+                return _result(step, artifact, executed=False)
             log.info("%s %s", position, step.label)
             artifact = self._run(step, executed)
+            self._share(step, artifact)
             log.info("%s %s done in %.1f s", position, step.label, artifact.manifest.duration)
             return _result(step, artifact, executed=True)
+
+    def _share(self, step: Step, artifact: Artifact) -> None:
+        """Give a new artifact to the remote store. A failure costs others time, not this run its result."""
+        if self.remote is None:
+            return
+        try:
+            self.remote.push(artifact)
+        except RemoteStoreError as error:
+            log.warning("%s could not be sent (`rtgs cache push` does it later): %s", step.label, error)
 
     @contextmanager
     def _locked(self, step: Step, position: str) -> Iterator[None]:
@@ -89,7 +104,7 @@ class InlineExecutor:
     def _run(self, step: Step, executed: frozenset[str]) -> Artifact:
         """Execute under the lock. A failed attempt leaves nothing but its checkpoints."""
         self.store.discard_attempts(step)
-        attempt, partial = self.store.new_attempt(step), self.store.partial(step)
+        attempt, partial = self.store.new_attempt(step.name, step.fingerprint), self.store.partial(step)
         partial.mkdir(parents=True, exist_ok=True)
         inputs = {other.name: self.store.folder(other) for other in step.upstream}
         tags = {f"rtgs.upstream.{other.name}": other.fingerprint for other in step.upstream}
@@ -105,7 +120,7 @@ class InlineExecutor:
         except Exception as error:
             raise StepFailed(step, error) from error
         finally:
-            shutil.rmtree(attempt, ignore_errors=True)
+            self.store.drop(attempt)
             if partial.exists() and not any(partial.iterdir()):
                 partial.rmdir()
 

@@ -59,10 +59,17 @@ class Manifest:
     def read(folder: Path) -> Manifest | None:
         """The manifest of ``folder``, or None when there is none that reads as one."""
         try:
-            content = json.loads((folder / NAME).read_text(encoding="utf-8"))
-            files = {name: FileRecord(**record) for name, record in content.pop("files").items()}
-            return Manifest(files=files, **content)
-        except (FileNotFoundError, NotADirectoryError, ValueError, TypeError, KeyError, AttributeError):
+            return Manifest.parse(json.loads((folder / NAME).read_text(encoding="utf-8")))
+        except (FileNotFoundError, NotADirectoryError, ValueError):
+            return None
+
+    @staticmethod
+    def parse(content: Any) -> Manifest | None:
+        """The manifest that decoded JSON stands for, or None when it is not one."""
+        try:
+            files = {name: FileRecord(**record) for name, record in content["files"].items()}
+            return Manifest(**{**content, "files": files})
+        except (ValueError, TypeError, KeyError, AttributeError):
             return None
 
     @property

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from rtgs.errors import RtgsError
 from rtgs.pipeline.fingerprint import flatten
 from rtgs.pipeline.manifest import Manifest
+from rtgs.pipeline.remote import RemoteStore
 from rtgs.pipeline.step import Step
 from rtgs.pipeline.store import Store
 
@@ -22,6 +23,7 @@ class PlannedStep:
     step: Step
     hit: bool
     reason: str
+    remote: bool = False  # not here, but in the remote store: it will be fetched instead of run
 
 
 @dataclass(frozen=True)
@@ -62,11 +64,12 @@ def topological(targets: Sequence[Step]) -> tuple[Step, ...]:
     return tuple(done.values())
 
 
-def make_plan(targets: Sequence[Step], store: Store) -> Plan:
-    """Look every step of the graph up in the store.
+def make_plan(targets: Sequence[Step], store: Store, remote: RemoteStore | None = None) -> Plan:
+    """Look every step of the graph up in the store, and what it lacks in the remote one.
 
     Raises:
         RtgsError: no targets.
+        RemoteStoreError: the remote store cannot be reached.
     """
     if not targets:
         raise RtgsError("nothing to plan: the graph has no target steps")
@@ -75,6 +78,9 @@ def make_plan(targets: Sequence[Step], store: Store) -> Plan:
     for step in topological(targets):
         if store.find(step) is not None:
             planned.append(PlannedStep(step, True, ""))
+            continue
+        if remote and remote.manifest(step.name, step.fingerprint) is not None:
+            planned.append(PlannedStep(step, False, f"will be fetched from {remote.url}", remote=True))
             continue
         if step.name not in neighbours:
             neighbours[step.name] = [artifact.manifest for artifact in store.artifacts(step.name)]

@@ -75,18 +75,28 @@ class Store:
 
     def lock(self, step: Step) -> FileLock:
         """The kernel lock of this recipe, not yet acquired."""
-        return self._lock(step.name, step.fingerprint)
+        return self.lock_of(step.name, step.fingerprint)
 
-    def _lock(self, name: str, fingerprint: str) -> FileLock:
+    def has(self, name: str, fingerprint: str) -> bool:
+        """Whether the finished artifact of this recipe is here."""
+        return _artifact(self._shelf(name, fingerprint) / fingerprint) is not None
+
+    def lock_of(self, name: str, fingerprint: str) -> FileLock:
+        """The kernel lock of a recipe by its name, not yet acquired."""
         shelf = self._shelf(name, fingerprint)
         shelf.mkdir(parents=True, exist_ok=True)
         return FileLock(str(shelf / f"{fingerprint}.lock"))
 
-    def new_attempt(self, step: Step) -> Path:
-        """An empty temporary folder beside the artifact's place, unique to this attempt."""
-        folder = self.folder(step).with_name(f"{step.fingerprint}.tmp-{secrets.token_hex(6)}")
+    def new_attempt(self, name: str, fingerprint: str) -> Path:
+        """An empty temporary folder beside the place of the artifact, unique to this attempt."""
+        folder = self._shelf(name, fingerprint) / f"{fingerprint}.tmp-{secrets.token_hex(6)}"
         folder.mkdir(parents=True)
         return folder
+
+    @staticmethod
+    def drop(attempt: Path) -> None:
+        """Remove an attempt that is not wanted, or was published: whichever it is, nothing is left of it."""
+        shutil.rmtree(attempt, ignore_errors=True)
 
     def discard_attempts(self, step: Step) -> None:
         """Remove what killed attempts left. Only for the holder of the lock: then every temporary folder is dead."""
@@ -100,8 +110,12 @@ class Store:
         """
         created = datetime.now(UTC).isoformat(timespec="seconds")
         manifests.describe(step, attempt, duration, created).write(attempt)
+        return self.adopt(step.name, step.fingerprint, attempt)
+
+    def adopt(self, name: str, fingerprint: str, attempt: Path) -> Artifact:
+        """Put a complete attempt, manifest included, in its place with one rename; the first one there wins."""
         _sync_tree(attempt)
-        place = self.folder(step)
+        place = self._shelf(name, fingerprint) / fingerprint
         if place.exists() and _artifact(place) is None:
             shutil.rmtree(place)  # without a sound manifest: garbage
         try:
@@ -111,7 +125,7 @@ class Store:
                 raise
             shutil.rmtree(attempt, ignore_errors=True)
         _sync(place.parent)
-        shutil.rmtree(self.partial(step), ignore_errors=True)
+        shutil.rmtree(self.root / name / "partial" / fingerprint, ignore_errors=True)
         artifact = _artifact(place)
         if artifact is None:
             raise RtgsError(f"the artifact {place} changed while it was published; is another program writing there?")
@@ -141,7 +155,7 @@ class Store:
         dead: list[Path] = []
         size = 0
         for name, fingerprint, path in list(self._candidates(partial, older_than)):
-            lock = self._lock(name, fingerprint)
+            lock = self.lock_of(name, fingerprint)
             try:
                 with lock.acquire(timeout=0):
                     size += sum(file.stat().st_size for file in path.rglob("*") if file.is_file())

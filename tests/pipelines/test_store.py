@@ -79,7 +79,7 @@ def test_a_torn_artifact_is_not_accepted(tmp_path, damage):
 def test_publishing_onto_a_finished_artifact_returns_theirs(tmp_path):
     step = Step("prep", 1, ToyParams(1.0, str(tmp_path)), prep)
     store = run(tmp_path, step)
-    late = store.new_attempt(step)
+    late = store.new_attempt(step.name, step.fingerprint)
     (late / "data.txt").write_text("late")
     artifact = store.publish(step, late, 1.0)
     assert (artifact.folder / "data.txt").read_text() == "1.0"
@@ -100,7 +100,7 @@ def test_verify_reads_every_byte(tmp_path):
 def test_garbage_collection_spares_work_in_progress(tmp_path):
     store = run(tmp_path)
     dead, alive = (Step("prep", 1, ToyParams(value), prep) for value in (7.0, 8.0))
-    attempts = [store.new_attempt(step) for step in (dead, alive)]
+    attempts = [store.new_attempt(step.name, step.fingerprint) for step in (dead, alive)]
     (attempts[0] / "part").write_text("12345")
     store.partial(dead).mkdir(parents=True)
     with store.lock(alive):

@@ -1,0 +1,149 @@
+"""A store that machines share: the layout of the local one behind any URL of fsspec (s3://, sftp://, a folder)."""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from rtgs.errors import RtgsError
+from rtgs.pipeline import manifest as manifests
+from rtgs.pipeline.fingerprint import file_digest
+from rtgs.pipeline.manifest import Manifest
+from rtgs.pipeline.store import Artifact, Store
+
+log = logging.getLogger("rtgs.pipeline")
+_PLACE = re.compile(r"([a-z][a-z0-9_]*)/[0-9a-f]{2}/([0-9a-f]{64})/" + re.escape(manifests.NAME))
+
+
+class RemoteStoreError(RtgsError):
+    """The remote store cannot be reached, or holds something that is not what its manifest says."""
+
+
+class RemoteStore:
+    """Finished artifacts behind a URL. Files go up first and the manifest last, so a half-sent artifact does not exist.
+
+    Credentials and endpoints are the file system's own affair (``AWS_ACCESS_KEY_ID``, ``AWS_ENDPOINT_URL``, ...): none
+    is ever part of a config or a manifest.
+    """
+
+    def __init__(self, url: str) -> None:
+        """Open ``url``, for example ``s3://bucket/rtgs``.
+
+        Raises:
+            RemoteStoreError: no file system for this kind of URL, or fsspec is not installed.
+        """
+        self.url = url.rstrip("/")
+        try:
+            import fsspec
+        except ImportError as error:
+            raise RemoteStoreError("a remote store needs fsspec: pip install 'rtgs[cluster]'") from error
+        try:
+            self._fs, self._root = fsspec.core.url_to_fs(self.url)
+        except (ValueError, ImportError) as error:
+            raise RemoteStoreError(
+                f"remote store {self.url}: {error} (extra `cluster` brings s3fs for s3://)"
+            ) from error
+        self._fs.use_listings_cache = False  # others write there while we look
+
+    def manifest(self, name: str, fingerprint: str) -> Manifest | None:
+        """The manifest of a finished artifact there; None when there is none."""
+        try:
+            text = self._fs.cat_file(f"{self._folder(name, fingerprint)}/{manifests.NAME}")
+        except FileNotFoundError:
+            return None
+        except Exception as error:
+            raise self._unreachable(error) from error
+        found = Manifest.parse(json.loads(text))
+        if found is None or (found.step, found.fingerprint) != (name, fingerprint):
+            raise RemoteStoreError(
+                f"{self.url}: the manifest of {name} {fingerprint[:12]} is not one of that artifact; delete the folder "
+                f"{self._folder(name, fingerprint)} there"
+            )
+        return found
+
+    def artifacts(self, name: str | None = None) -> Iterator[tuple[str, str]]:
+        """(step, fingerprint) of every finished artifact there, or those of one step name."""
+        try:
+            paths = self._fs.find(f"{self._root}/{name}" if name else self._root)
+        except FileNotFoundError:
+            return
+        except Exception as error:
+            raise self._unreachable(error) from error
+        for path in sorted(paths):
+            if match := _PLACE.fullmatch(path[len(self._root) :].strip("/")):
+                yield match.group(1), match.group(2)
+
+    def push(self, artifact: Artifact) -> bool:
+        """Send an artifact; False when it was there already.
+
+        Raises:
+            RemoteStoreError: the store cannot be reached or refuses to be written.
+        """
+        manifest, folder = artifact.manifest, self._folder(artifact.manifest.step, artifact.manifest.fingerprint)
+        if self.manifest(manifest.step, manifest.fingerprint) is not None:
+            return False
+        try:
+            for file in manifest.files:
+                target = f"{folder}/{file}"
+                self._fs.makedirs(target.rpartition("/")[0], exist_ok=True)
+                self._fs.put_file(str(artifact.folder / file), target)
+            self._fs.pipe_file(f"{folder}/{manifests.NAME}", (artifact.folder / manifests.NAME).read_bytes())
+        except Exception as error:
+            raise self._unreachable(error) from error
+        return True
+
+    def fetch(self, name: str, fingerprint: str, store: Store) -> Artifact | None:
+        """Bring an artifact into ``store``, every digest checked; None when there is none.
+
+        The caller holds the recipe's lock, or takes the risk of downloading twice (one of the two is dropped).
+
+        Raises:
+            RemoteStoreError: a file is missing or differs from its digest; nothing is taken over.
+        """
+        manifest = self.manifest(name, fingerprint)
+        if manifest is None:
+            return None
+        source, attempt = self._folder(name, fingerprint), store.new_attempt(name, fingerprint)
+        try:
+            for file, record in manifest.files.items():
+                target = attempt / _inside(file, self.url)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                self._download(f"{source}/{file}", target)
+                if target.stat().st_size != record.size or file_digest(target) != record.sha256:
+                    raise RemoteStoreError(
+                        f"{self.url}: {name}/{fingerprint[:12]}/{file} is not what its manifest says; delete the "
+                        "artifact there, the next run makes it again"
+                    )
+            manifest.write(attempt)
+            return store.adopt(name, fingerprint, attempt)
+        finally:
+            store.drop(attempt)
+
+    def _download(self, source: str, target: Path) -> None:
+        try:
+            self._fs.get_file(source, str(target))
+        except Exception as error:
+            raise self._unreachable(error) from error
+
+    def _folder(self, name: str, fingerprint: str) -> str:
+        return f"{self._root}/{name}/{fingerprint[:2]}/{fingerprint}"
+
+    def _unreachable(self, error: BaseException) -> RemoteStoreError:
+        return RemoteStoreError(
+            f"remote store {self.url}: {type(error).__name__}: {error}; check its address and credentials, or run "
+            "without it (paths.remote=''): the local store is complete in itself"
+        )
+
+
+def _inside(name: str, url: str) -> Any:
+    """A relative path that stays inside its folder: manifests of a shared place are not to be trusted."""
+    path = PurePosixPath(name)
+    if path.is_absolute() or ".." in path.parts or not path.parts or "\\" in name:
+        raise RemoteStoreError(
+            f"{url}: a manifest lists the file {name!r}, which leaves its folder; delete that artifact"
+        )
+    return path
