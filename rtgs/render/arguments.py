@@ -1,4 +1,4 @@
-"""What the rasteriser and its twin ask of their arguments."""
+"""What the rasterisers and their twins ask of their arguments."""
 
 from __future__ import annotations
 
@@ -16,8 +16,9 @@ def check_shapes(
     features: Tensor,
     background: Tensor | None,
     screen_probe: Tensor | None,
+    scale_axes: int = 2,
 ) -> None:
-    """Raise ValueError, naming the tensor, when a shape does not fit N surfels and C channels."""
+    """Raise ValueError, naming the tensor, when a shape does not fit N Gaussians of this many scales and C channels."""
     count = means.shape[0] if means.ndim else 0
     channels = features.shape[1] if features.ndim == 2 else 0
     if not 1 <= channels <= MAX_CHANNELS:
@@ -26,7 +27,7 @@ def check_shapes(
         "means": (means, (count, 3)),
         "tangent_u": (tangent_u, (count, 3)),
         "tangent_v": (tangent_v, (count, 3)),
-        "scales": (scales, (count, 2)),
+        "scales": (scales, (count, scale_axes)),
         "opacities": (opacities, (count,)),
         "features": (features, (count, channels)),
         "background": (background, (channels,)),

@@ -98,7 +98,7 @@ def rasterize_surfels(
 
     columns, weight_sums = [], []
     for chunk in pixel_chunks(pixels, len(keep)):
-        picture, weights = _maybe_checkpoint(lambda part: composite(surfels, part, options), chunk, len(pixels))
+        picture, weights = checkpointed(lambda part: composite(surfels, part, options), chunk, len(pixels))
         columns.append(picture)
         weight_sums.append(weights)
     picture = torch.cat(columns).T.reshape(-1, camera.height, camera.width)
@@ -315,7 +315,7 @@ def distortion(weight: Tensor, before: Tensor, depth: Tensor, near: float, far: 
     return (weight * (mapped.square() * (1 - before) + moment2 - 2 * mapped * moment1)).sum(1)
 
 
-def _maybe_checkpoint(
+def checkpointed(
     function: Callable[[Tensor], tuple[Tensor, Tensor]], chunk: Tensor, total: int
 ) -> tuple[Tensor, Tensor]:
     """Recompute a chunk in the backward pass when there are several, so that memory stays that of one chunk."""

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from rtgs.cameras import Camera
-from rtgs.render.buffers import RasterBuffers, RasterOptions
+from rtgs.render.buffers import EllipsoidBuffers, RasterBuffers, RasterOptions
 from rtgs.render.reference import rasterize_surfels
 
 from .strategies import SurfelTensors
@@ -52,7 +52,7 @@ def render(
     return rasterize_surfels(*surfels.all(), camera, options=options, **extra)
 
 
-def output(buffers: RasterBuffers, name: str) -> Tensor:
+def output(buffers: RasterBuffers | EllipsoidBuffers, name: str) -> Tensor:
     """A picture that was asked for."""
     picture = getattr(buffers, name)
     assert picture is not None

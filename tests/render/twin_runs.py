@@ -82,8 +82,8 @@ def rounded(recipe: Recipe) -> Run:
 class Pools:
     """Errors of every picture and gradient against the exact twin, pooled over examples."""
 
-    def __init__(self) -> None:
-        self.pictures = {name: ErrorPool() for name in OUTPUTS}
+    def __init__(self, outputs: tuple[str, ...] = OUTPUTS) -> None:
+        self.pictures = {name: ErrorPool() for name in outputs}
         self.gradients = {name: ErrorPool() for name in (*NAMES, SIGNAL)}
         self.weight_sum = ErrorPool()
 
