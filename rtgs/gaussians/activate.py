@@ -1,4 +1,4 @@
-"""Native fused activation of surfels: tangents, scales, opacities, SH colours, and the backward pass.
+"""Native fused activation of surfels and ellipsoids: tangents, scales, opacities, SH colours, and the backward pass.
 
 The readable twin is :func:`rtgs.gaussians.surfels.activate`; rules at degenerate input (zero
 quaternion, mean at the camera centre, extreme logits and log-scales) are the same in both.
@@ -6,19 +6,22 @@ quaternion, mean at the camera centre, extreme logits and log-scales) are the sa
 
 from __future__ import annotations
 
+from dataclasses import fields
+
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from rtgs.gaussians.surfels import ActivatedSurfels, Surfels
+from rtgs.gaussians.primitives import Gaussians
+from rtgs.gaussians.surfels import ActivatedSurfels
 from rtgs.native import core
 
 
-def activate_surfels(surfels: Surfels, camera_center: Tensor, sh_degree: int) -> ActivatedSurfels:
+def activate_surfels(surfels: Gaussians, camera_center: Tensor, sh_degree: int) -> ActivatedSurfels:
     """Activate for one camera, float32, differentiable by every raw parameter.
 
     Args:
-        surfels: N surfels, float32 on the CPU.
+        surfels: N surfels (two scales) or ellipsoids (three), float32 on the CPU.
         camera_center: (3,) world; a constant (it gets no gradient).
         sh_degree: active degree; capped by what the surfels hold.
 
@@ -26,13 +29,14 @@ def activate_surfels(surfels: Surfels, camera_center: Tensor, sh_degree: int) ->
         TypeError: a parameter is not float32 on the CPU.
         ValueError: shapes do not match.
     """
-    for name, tensor in surfels.items():
+    shared = [(field.name, getattr(surfels, field.name)) for field in fields(Gaussians)]  # a kind may have more
+    for name, tensor in shared:
         if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
             raise TypeError(
                 f"surfels.{name} is {tensor.dtype} on {tensor.device}; activate_surfels takes float32 on the CPU "
                 "(rtgs.gaussians.surfels.activate takes any dtype)"
             )
-    raw = tuple(tensor for _, tensor in surfels.items())
+    raw = tuple(tensor for _, tensor in shared)
     center = tuple(camera_center.tolist())
     outputs = _Activate.apply(center, min(sh_degree, surfels.sh_degree), *raw)
     return ActivatedSurfels(surfels.means, *outputs)
@@ -48,7 +52,7 @@ class _Activate(torch.autograd.Function):
     def forward(ctx, center: tuple[float, float, float], degree: int, *raw: Tensor):
         count = len(raw[0])
         rows = raw[0].new_empty
-        outputs = (rows(count, 3), rows(count, 3), rows(count, 2), rows(count), rows(count, 3))
+        outputs = (rows(count, 3), rows(count, 3), torch.empty_like(raw[1]), rows(count), rows(count, 3))
         needs_backward = any(ctx.needs_input_grad)
         saved = rows(core.activation_saved_size(count)) if needs_backward else None
         core.activate_surfels(

@@ -9,14 +9,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import torch
 from torch import Tensor
 
-from rtgs.gaussians.surfels import LOG_SCALE_LIMIT, Surfels, tangents
+from rtgs.gaussians.primitives import Gaussians
 from rtgs.train.adam import SurfelAdam
 from rtgs.train.settings import DensitySettings
+
+Kind = TypeVar("Kind", bound=Gaussians)
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,7 @@ class RowPlan:
     """A change of N: rows ``keep`` of the old surfels in this order, then the rows of ``added``."""
 
     keep: Tensor  # (M,) int64
-    added: Surfels  # raw parameters of new surfels, no gradient
+    added: Gaussians  # raw parameters of new surfels, no gradient
 
 
 class HasRows(Protocol):
@@ -45,7 +47,7 @@ class HasRows(Protocol):
     def append(self, count: int) -> None: ...
 
 
-def apply_plan(plan: RowPlan, surfels: Surfels, *followers: HasRows) -> None:
+def apply_plan(plan: RowPlan, surfels: Gaussians, *followers: HasRows) -> None:
     """Change N of the surfels (in place: new leaf tensors, gradients dropped) and of all that has a row for each.
 
     The only way N ever changes, so that parameters, moments and statistics cannot get out of step. Followers give new
@@ -60,22 +62,20 @@ def apply_plan(plan: RowPlan, surfels: Surfels, *followers: HasRows) -> None:
         follower.append(len(plan.added))
 
 
-def select_rows(surfels: Surfels, index: Tensor) -> Surfels:
+def select_rows(surfels: Kind, index: Tensor) -> Kind:
     """A copy of rows ``index`` (int64 or bool), without gradient."""
     return type(surfels)(**{name: values.detach()[index] for name, values in surfels.items()})
 
 
-def split_surfels(surfels: Surfels, count: int, shrink: float, generator: torch.Generator) -> Surfels:
-    """``count`` children of each surfel, drawn from its Gaussian in its own plane, with scales divided by ``shrink``.
+def split_surfels(surfels: Kind, count: int, shrink: float, generator: torch.Generator) -> Kind:
+    """``count`` children of each Gaussian, drawn from it (a surfel: in its plane), with scales divided by ``shrink``.
 
     Returns:
         N * count surfels; the children of one parent are neighbours. All else is inherited.
     """
     children = select_rows(surfels, torch.arange(len(surfels)).repeat_interleave(count))
-    tangent_u, tangent_v = tangents(children.quaternions)
-    scales = children.log_scales.clamp(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT).exp()
-    offset = scales * torch.randn(len(children), 2, generator=generator)
-    children.means = children.means + offset[:, :1] * tangent_u + offset[:, 1:] * tangent_v
+    normal = torch.randn(*children.log_scales.shape, generator=generator)
+    children.means = children.means + (normal[..., None] * children.deviations()).sum(dim=1)
     children.log_scales = children.log_scales - math.log(shrink)
     return children
 
@@ -155,7 +155,7 @@ class DensityControl:
         return self.weight_sum / self.visible_steps.clamp_min(1)
 
     @torch.no_grad()
-    def densify(self, surfels: Surfels, optimizer: SurfelAdam, generator: torch.Generator) -> DensityReport:
+    def densify(self, surfels: Gaussians, optimizer: SurfelAdam, generator: torch.Generator) -> DensityReport:
         """Clone, split and prune; the statistics start afresh. Without an observed step only pruning and splitting by
         opacity and size happen."""
         if not len(self.visible_steps):
@@ -224,7 +224,7 @@ class DensityControl:
         return RowPlan(plan.keep[stays[:kept]], select_rows(plan.added, stays[kept:])), excess
 
     @torch.no_grad()
-    def reset_opacity(self, surfels: Surfels, optimizer: SurfelAdam) -> None:
+    def reset_opacity(self, surfels: Gaussians, optimizer: SurfelAdam) -> None:
         """Opacity becomes min(opacity, ``settings.reset_opacity``); its moments become 0."""
         surfels.opacity_logits.clamp_(max=logit(self.settings.reset_opacity))
         optimizer.zero_moments("opacity_logits")
@@ -276,7 +276,7 @@ def highest(chosen: Tensor, values: Tensor, count: int) -> Tensor:
     return limited
 
 
-def concatenate(parts: tuple[Surfels, ...]) -> Surfels:
+def concatenate(parts: tuple[Kind, ...]) -> Kind:
     """The rows of all parts, in order."""
     return type(parts[0])(**{name: torch.cat([getattr(p, name) for p in parts]) for name, _ in parts[0].items()})
 

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from rtgs.gaussians.activate import activate_surfels
 from rtgs.gaussians.density import DensityControl, DensityReport
-from rtgs.gaussians.surfels import ActivatedSurfels, Surfels
+from rtgs.gaussians.primitives import Gaussians
+from rtgs.gaussians.surfels import ActivatedSurfels
 from rtgs.train.adam import SurfelAdam
 from rtgs.train.settings import DensitySettings, OptimizerSettings
 
@@ -24,7 +25,7 @@ class Observation:
 
 
 class SurfelSet:
-    """Surfels + :class:`SurfelAdam` + :class:`DensityControl`, kept consistent through every change of N.
+    """Gaussians of one kind + :class:`SurfelAdam` + :class:`DensityControl`, kept consistent through every change of N.
 
     ``name`` prefixes its tensors in a checkpoint and its lines in reports; ``extent`` is the scene's, world units.
     """
@@ -32,7 +33,7 @@ class SurfelSet:
     def __init__(
         self,
         name: str,
-        surfels: Surfels,
+        surfels: Gaussians,
         *,
         optimizer: OptimizerSettings,
         density: DensitySettings,

@@ -16,14 +16,15 @@ void require(const Floats& a, const char* name, size_t count, size_t columns) {
                                 " numbers, expected " + std::to_string(count) + " x " + std::to_string(columns));
 }
 
-ActivationShape checked_shape(const nb::tuple& center, int degree, const Floats& sh_rest, size_t count, int threads) {
+ActivationShape checked_shape(const nb::tuple& center, int degree, const Floats (&raw)[6], size_t count, int threads) {
+  const Floats& sh_rest = raw[5];
   if (sh_rest.ndim() != 3 || sh_rest.shape(0) != count || sh_rest.shape(2) != 3)
     throw std::invalid_argument("activate_surfels: sh_rest must be (N, K, 3)");
   const int rest = int(sh_rest.shape(1));
   if (degree < 0 || degree > 3 || (degree + 1) * (degree + 1) - 1 > rest)
     throw std::invalid_argument("activate_surfels: SH degree " + std::to_string(degree) + " does not fit the " +
                                 std::to_string(rest) + " stored coefficients (degree 0 .. 3)");
-  ActivationShape shape{long(count), degree, rest, {}, threads < 1 ? 1 : threads};
+  ActivationShape shape{long(count), degree, rest, int(raw[1].shape(1)), {}, threads < 1 ? 1 : threads};
   for (int k = 0; k < 3; ++k) shape.center[k] = nb::cast<float>(center[k]);
   return shape;
 }
@@ -33,7 +34,9 @@ RawSurfels checked_raw(const nb::tuple& raw, size_t& count, Floats (&hold)[6]) {
   for (int k = 0; k < 6; ++k) hold[k] = nb::cast<Floats>(raw[k]);
   count = hold[0].ndim() == 2 ? hold[0].shape(0) : 0;
   require(hold[0], "means", count, 3);
-  require(hold[1], "log_scales", count, 2);
+  if (hold[1].ndim() != 2 || (hold[1].shape(1) != 2 && hold[1].shape(1) != 3))
+    throw std::invalid_argument("activate_surfels: log_scales must be (N, 2), or (N, 3) of ellipsoids");
+  require(hold[1], "log_scales", count, hold[1].shape(1));
   require(hold[2], "quaternions", count, 4);
   require(hold[3], "opacity_logits", count, 1);
   require(hold[4], "sh_dc", count, 3);
@@ -42,12 +45,12 @@ RawSurfels checked_raw(const nb::tuple& raw, size_t& count, Floats (&hold)[6]) {
 
 struct ActivatedArrays {
   Floats tangent_u, tangent_v, scales, opacities, colors;
-  ActivatedArrays(const nb::tuple& t, size_t count)
+  ActivatedArrays(const nb::tuple& t, size_t count, size_t scale_count)
       : tangent_u(nb::cast<Floats>(t[0])), tangent_v(nb::cast<Floats>(t[1])), scales(nb::cast<Floats>(t[2])),
         opacities(nb::cast<Floats>(t[3])), colors(nb::cast<Floats>(t[4])) {
     require(tangent_u, "tangent_u", count, 3);
     require(tangent_v, "tangent_v", count, 3);
-    require(scales, "scales", count, 2);
+    require(scales, "scales", count, scale_count);
     require(opacities, "opacities", count, 1);
     require(colors, "colors", count, 3);
   }
@@ -60,8 +63,8 @@ void activate(const nb::tuple& raw, const nb::tuple& center, int degree, const n
   size_t count;
   Floats hold[6];
   const RawSurfels in = checked_raw(raw, count, hold);
-  const ActivationShape shape = checked_shape(center, degree, hold[5], count, threads);
-  const ActivatedArrays a(out, count);
+  const ActivationShape shape = checked_shape(center, degree, hold, count, threads);
+  const ActivatedArrays a(out, count, shape.scales);
   if (saved) require(*saved, "saved", saved_size(count), 1);
   const Activated to = {a.tangent_u.data(), a.tangent_v.data(), a.scales.data(), a.opacities.data(), a.colors.data()};
   float* keep = saved ? saved->data() : nullptr;
@@ -75,11 +78,11 @@ void activate_backward(const nb::tuple& raw, const nb::tuple& center, int degree
   Floats hold[6], gradient_hold[6];
   const RawSurfels in = checked_raw(raw, count, hold);
   checked_raw(gradients, gradient_count, gradient_hold);
-  const ActivationShape shape = checked_shape(center, degree, hold[5], count, threads);
-  if (gradient_count != count || gradient_hold[5].size() != hold[5].size())
+  const ActivationShape shape = checked_shape(center, degree, hold, count, threads);
+  if (gradient_count != count || gradient_hold[1].size() != hold[1].size() || gradient_hold[5].size() != hold[5].size())
     throw std::invalid_argument("activate_surfels: gradients must have the shapes of the parameters");
-  const ActivatedArrays a(upstream, count);
-  require(scales, "scales", count, 2);
+  const ActivatedArrays a(upstream, count, shape.scales);
+  require(scales, "scales", count, shape.scales);
   require(saved, "saved", saved_size(count), 1);
   const ActivatedGradients up = {a.tangent_u.data(), a.tangent_v.data(), a.scales.data(), a.opacities.data(),
                                  a.colors.data()};

@@ -1,4 +1,4 @@
-// Activations of surfels, one surfel a lane. Every surfel is independent: the result is the same for any thread count.
+// Activations of surfels and ellipsoids (Scales = 2, 3), one a lane. Every surfel is independent: the result is the same for any thread count.
 #include "surfel_kernels.h"
 
 #include <cstring>
@@ -39,8 +39,9 @@ inline float* saved_of(float* saved, long first) {
   return saved + first / kSavedGroup * (kSavedGroup * kSavedFloats) + first % kSavedGroup;
 }
 
+template <int Scales>
 inline void activate_shape(const RawSurfels& in, const Activated& out) {
-  vfloat q[4], u[3], v[3], s[2];
+  vfloat q[4], u[3], v[3], s[Scales];
   load_rows<4>(in.quaternions, q);
   normalize<4>(q);
   const vfloat w = q[0], x = q[1], y = q[2], z = q[3];
@@ -48,9 +49,9 @@ inline void activate_shape(const RawSurfels& in, const Activated& out) {
   v[0] = 2.f * (x * y - w * z), v[1] = 1.f - 2.f * (x * x + z * z), v[2] = 2.f * (y * z + w * x);
   store_rows<3>(out.tangent_u, u);
   store_rows<3>(out.tangent_v, v);
-  load_rows<2>(in.log_scales, s);
-  for (int k = 0; k < 2; ++k) s[k] = exp(clamp(s[k], -kLogScaleLimit, kLogScaleLimit));
-  store_rows<2>(out.scales, s);
+  load_rows<Scales>(in.log_scales, s);
+  for (int k = 0; k < Scales; ++k) s[k] = exp(clamp(s[k], -kLogScaleLimit, kLogScaleLimit));
+  store_rows<Scales>(out.scales, s);
   store(out.opacities, sigmoid(load(in.opacity_logits)));
 }
 
@@ -84,9 +85,10 @@ inline void activate_color(const ActivationShape& shape, const RawSurfels& in, c
   store_rows<3>(out.colors, color);
 }
 
+template <int Scales>
 inline void shape_backward(const RawSurfels& in, const float* scales, const ActivatedGradients& up,
                            const RawGradients& out) {
-  vfloat q[4], u[3], v[3], g[4], s[2], gs[2], logs[2];
+  vfloat q[4], u[3], v[3], g[4], s[Scales], gs[Scales], logs[Scales];
   load_rows<4>(in.quaternions, q);
   const vfloat inverse = normalize<4>(q);
   const vfloat w = q[0], x = q[1], y = q[2], z = q[3];
@@ -100,11 +102,11 @@ inline void shape_backward(const RawSurfels& in, const float* scales, const Acti
   for (int k = 0; k < 4; ++k) g[k] = (g[k] - q[k] * radial) * inverse;
   store_rows<4>(out.quaternions, g);
 
-  load_rows<2>(scales, s);
-  load_rows<2>(up.scales, gs);
-  load_rows<2>(in.log_scales, logs);
-  for (int k = 0; k < 2; ++k) gs[k] = where(le(abs(logs[k]), broadcast(kLogScaleLimit)), gs[k] * s[k]);
-  store_rows<2>(out.log_scales, gs);
+  load_rows<Scales>(scales, s);
+  load_rows<Scales>(up.scales, gs);
+  load_rows<Scales>(in.log_scales, logs);
+  for (int k = 0; k < Scales; ++k) gs[k] = where(le(abs(logs[k]), broadcast(kLogScaleLimit)), gs[k] * s[k]);
+  store_rows<Scales>(out.log_scales, gs);
   const vfloat e = exp(-abs(load(in.opacity_logits))), one = 1.f + e;  // o (1 - o) without cancellation near o = 1
   store(out.opacity_logits, load(up.opacities) * e / (one * one));
 }
@@ -144,74 +146,76 @@ inline void color_backward(const ActivationShape& shape, const RawSurfels& in, c
 
 // ---- rows of the last, partly filled block go through a padded copy ---------------------------------------------
 struct Padded {
-  float means[3 * kLanes], log_scales[2 * kLanes], quaternions[4 * kLanes], opacity_logits[kLanes], sh_dc[3 * kLanes],
+  float means[3 * kLanes], log_scales[3 * kLanes], quaternions[4 * kLanes], opacity_logits[kLanes], sh_dc[3 * kLanes],
       sh_rest[45 * kLanes];
 };
 struct PaddedActivated {
-  float tangent_u[3 * kLanes], tangent_v[3 * kLanes], scales[2 * kLanes], opacities[kLanes], colors[3 * kLanes];
+  float tangent_u[3 * kLanes], tangent_v[3 * kLanes], scales[3 * kLanes], opacities[kLanes], colors[3 * kLanes];
 };
 
-inline RawSurfels rows_from(const RawSurfels& in, long i, int rest) {
-  return {in.means + 3 * i, in.log_scales + 2 * i, in.quaternions + 4 * i, in.opacity_logits + i, in.sh_dc + 3 * i,
+inline RawSurfels rows_from(const RawSurfels& in, long i, const ActivationShape& shape) {
+  const long rest = shape.rest;
+  return {in.means + 3 * i, in.log_scales + shape.scales * i, in.quaternions + 4 * i, in.opacity_logits + i, in.sh_dc + 3 * i,
           in.sh_rest + 3 * rest * i};
 }
-inline RawGradients rows_from(const RawGradients& g, long i, int rest) {
-  return {g.means + 3 * i, g.log_scales + 2 * i, g.quaternions + 4 * i, g.opacity_logits + i, g.sh_dc + 3 * i,
+inline RawGradients rows_from(const RawGradients& g, long i, const ActivationShape& shape) {
+  const long rest = shape.rest;
+  return {g.means + 3 * i, g.log_scales + shape.scales * i, g.quaternions + 4 * i, g.opacity_logits + i, g.sh_dc + 3 * i,
           g.sh_rest + 3 * rest * i};
 }
-inline Activated rows_from(const Activated& a, long i) {
-  return {a.tangent_u + 3 * i, a.tangent_v + 3 * i, a.scales + 2 * i, a.opacities + i, a.colors + 3 * i};
+inline Activated rows_from(const Activated& a, long i, int scales) {
+  return {a.tangent_u + 3 * i, a.tangent_v + 3 * i, a.scales + scales * i, a.opacities + i, a.colors + 3 * i};
 }
-inline ActivatedGradients rows_from(const ActivatedGradients& a, long i) {
-  return {a.tangent_u + 3 * i, a.tangent_v + 3 * i, a.scales + 2 * i, a.opacities + i, a.colors + 3 * i};
+inline ActivatedGradients rows_from(const ActivatedGradients& a, long i, int scales) {
+  return {a.tangent_u + 3 * i, a.tangent_v + 3 * i, a.scales + scales * i, a.opacities + i, a.colors + 3 * i};
 }
 inline void copy(float* to, const float* from, int rows, int columns) { memcpy(to, from, sizeof(float) * rows * columns); }
 
-inline RawSurfels padded_rows(Padded& p, const RawSurfels& in, int rows, int rest) {
+inline RawSurfels padded_rows(Padded& p, const RawSurfels& in, int rows, const ActivationShape& shape) {
   memset(&p, 0, sizeof p);
   copy(p.means, in.means, rows, 3);
-  copy(p.log_scales, in.log_scales, rows, 2);
+  copy(p.log_scales, in.log_scales, rows, shape.scales);
   copy(p.quaternions, in.quaternions, rows, 4);
   copy(p.opacity_logits, in.opacity_logits, rows, 1);
   copy(p.sh_dc, in.sh_dc, rows, 3);
-  copy(p.sh_rest, in.sh_rest, rows, 3 * rest);
+  copy(p.sh_rest, in.sh_rest, rows, 3 * shape.rest);
   return {p.means, p.log_scales, p.quaternions, p.opacity_logits, p.sh_dc, p.sh_rest};
 }
 
-template <int Degree>
+template <int Degree, int Scales>
 void activate_tail(const ActivationShape& shape, const RawSurfels& in, const Activated& out, float* saved, int rows) {
   Padded raw;
   PaddedActivated result;
-  const RawSurfels from = padded_rows(raw, in, rows, shape.rest);
+  const RawSurfels from = padded_rows(raw, in, rows, shape);
   const Activated to = {result.tangent_u, result.tangent_v, result.scales, result.opacities, result.colors};
-  activate_shape(from, to);
+  activate_shape<Scales>(from, to);
   activate_color<Degree>(shape, from, to, saved);  // saved has room for whole groups
   copy(out.tangent_u, to.tangent_u, rows, 3);
   copy(out.tangent_v, to.tangent_v, rows, 3);
-  copy(out.scales, to.scales, rows, 2);
+  copy(out.scales, to.scales, rows, Scales);
   copy(out.opacities, to.opacities, rows, 1);
   copy(out.colors, to.colors, rows, 3);
 }
 
-template <int Degree>
+template <int Degree, int Scales>
 void backward_tail(const ActivationShape& shape, const RawSurfels& in, const float* scales, const float* saved,
                    const ActivatedGradients& up, const RawGradients& out, int rows) {
   Padded raw, gradient;
   PaddedActivated g{};
-  float s[2 * kLanes] = {};
-  const RawSurfels from = padded_rows(raw, in, rows, shape.rest);
-  copy(s, scales, rows, 2);
+  float s[3 * kLanes] = {};
+  const RawSurfels from = padded_rows(raw, in, rows, shape);
+  copy(s, scales, rows, Scales);
   copy(g.tangent_u, up.tangent_u, rows, 3);
   copy(g.tangent_v, up.tangent_v, rows, 3);
-  copy(g.scales, up.scales, rows, 2);
+  copy(g.scales, up.scales, rows, Scales);
   copy(g.opacities, up.opacities, rows, 1);
   copy(g.colors, up.colors, rows, 3);
   const RawGradients to = {gradient.means, gradient.log_scales, gradient.quaternions, gradient.opacity_logits,
                            gradient.sh_dc, gradient.sh_rest};
-  shape_backward(from, s, {g.tangent_u, g.tangent_v, g.scales, g.opacities, g.colors}, to);
+  shape_backward<Scales>(from, s, {g.tangent_u, g.tangent_v, g.scales, g.opacities, g.colors}, to);
   color_backward<Degree>(shape, from, saved, g.colors, to);
   copy(out.means, to.means, rows, 3);
-  copy(out.log_scales, to.log_scales, rows, 2);
+  copy(out.log_scales, to.log_scales, rows, Scales);
   copy(out.quaternions, to.quaternions, rows, 4);
   copy(out.opacity_logits, to.opacity_logits, rows, 1);
   copy(out.sh_dc, to.sh_dc, rows, 3);
@@ -224,26 +228,26 @@ inline int useful_threads(const ActivationShape& shape) {
   return most < shape.threads ? int(most) : shape.threads;
 }
 
-template <int Degree>
+template <int Degree, int Scales>
 void forward(const ActivationShape& shape, const RawSurfels& in, const Activated& out, float* saved) {
   const long blocks = (shape.count + kLanes - 1) / kLanes;
   const int threads = useful_threads(shape);
 #pragma omp parallel for schedule(static) num_threads(threads) if (threads > 1)
   for (long block = 0; block < blocks; ++block) {
     const long i = block * kLanes;
-    const RawSurfels from = rows_from(in, i, shape.rest);
-    const Activated to = rows_from(out, i);
+    const RawSurfels from = rows_from(in, i, shape);
+    const Activated to = rows_from(out, i, Scales);
     float* keep = saved ? saved_of(saved, i) : nullptr;
     if (i + kLanes <= shape.count) {
-      activate_shape(from, to);
+      activate_shape<Scales>(from, to);
       activate_color<Degree>(shape, from, to, keep);
     } else {
-      activate_tail<Degree>(shape, from, to, keep, int(shape.count - i));
+      activate_tail<Degree, Scales>(shape, from, to, keep, int(shape.count - i));
     }
   }
 }
 
-template <int Degree>
+template <int Degree, int Scales>
 void backward(const ActivationShape& shape, const RawSurfels& in, const float* scales, const float* saved,
               const ActivatedGradients& up, const RawGradients& out) {
   const long blocks = (shape.count + kLanes - 1) / kLanes;
@@ -251,17 +255,29 @@ void backward(const ActivationShape& shape, const RawSurfels& in, const float* s
 #pragma omp parallel for schedule(static) num_threads(threads) if (threads > 1)
   for (long block = 0; block < blocks; ++block) {
     const long i = block * kLanes;
-    const RawSurfels from = rows_from(in, i, shape.rest);
-    const ActivatedGradients g = rows_from(up, i);
-    const RawGradients to = rows_from(out, i, shape.rest);
+    const RawSurfels from = rows_from(in, i, shape);
+    const ActivatedGradients g = rows_from(up, i, Scales);
+    const RawGradients to = rows_from(out, i, shape);
     const float* kept = saved_of(const_cast<float*>(saved), i);
     if (i + kLanes <= shape.count) {
-      shape_backward(from, scales + 2 * i, g, to);
+      shape_backward<Scales>(from, scales + Scales * i, g, to);
       color_backward<Degree>(shape, from, kept, g.colors, to);
     } else {
-      backward_tail<Degree>(shape, from, scales + 2 * i, kept, g, to, int(shape.count - i));
+      backward_tail<Degree, Scales>(shape, from, scales + Scales * i, kept, g, to, int(shape.count - i));
     }
   }
+}
+
+template <int Degree>
+void forward(const ActivationShape& shape, const RawSurfels& in, const Activated& out, float* saved) {
+  shape.scales == 2 ? forward<Degree, 2>(shape, in, out, saved) : forward<Degree, 3>(shape, in, out, saved);
+}
+
+template <int Degree>
+void backward(const ActivationShape& shape, const RawSurfels& in, const float* scales, const float* saved,
+              const ActivatedGradients& up, const RawGradients& out) {
+  shape.scales == 2 ? backward<Degree, 2>(shape, in, scales, saved, up, out)
+                    : backward<Degree, 3>(shape, in, scales, saved, up, out);
 }
 
 }  // namespace

@@ -1,12 +1,13 @@
-// Activation of raw surfel parameters for one camera centre, and its backward pass (methods.md section 2).
+// Activation of raw surfel (or ellipsoid) parameters for one camera centre, and its backward pass (methods.md section 2).
+// S, the number of scales, is 2 for surfels and 3 for ellipsoids.
 // The readable twin is rtgs.gaussians.surfels.activate.
 #pragma once
 
 namespace rtgs {
 
-struct RawSurfels {  // rows of rtgs.gaussians.surfels.Surfels, float32, contiguous
+struct RawSurfels {  // rows of rtgs.gaussians.primitives.Gaussians, float32, contiguous
   const float* means;           // (N, 3)
-  const float* log_scales;      // (N, 2)
+  const float* log_scales;      // (N, S)
   const float* quaternions;     // (N, 4) w, x, y, z
   const float* opacity_logits;  // (N,)
   const float* sh_dc;           // (N, 3)
@@ -15,7 +16,7 @@ struct RawSurfels {  // rows of rtgs.gaussians.surfels.Surfels, float32, contigu
 struct Activated {
   float* tangent_u;  // (N, 3)
   float* tangent_v;  // (N, 3)
-  float* scales;     // (N, 2)
+  float* scales;     // (N, S)
   float* opacities;  // (N,)
   float* colors;     // (N, 3)
 };
@@ -38,6 +39,7 @@ struct ActivationShape {
   long count;       // N
   int degree;       // active SH degree, 0 .. 3
   int rest;         // stored coefficients above degree 0, >= those of the active degree
+  int scales;       // S
   float center[3];  // camera centre, world
   int threads;
 };

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.autograd.graph import increment_version
 
 from rtgs.gaussians.harmonics import rest_count
-from rtgs.gaussians.surfels import Surfels
+from rtgs.gaussians.primitives import Gaussians
 from rtgs.native import core
 from rtgs.train.settings import OptimizerSettings
 
@@ -69,11 +69,13 @@ class SurfelAdam:
     """
 
     def __init__(
-        self, surfels: Surfels, settings: OptimizerSettings, extent: float, *, means_lr_steps: int = 30_000
+        self, surfels: Gaussians, settings: OptimizerSettings, extent: float, *, means_lr_steps: int = 30_000
     ) -> None:
         """``extent``: of the scene, world units; ``means_lr_steps``: steps over which the means' rate decays."""
         if not (math.isfinite(extent) and extent > 0):
             raise ValueError(f"scene extent {extent} must be positive; are all training cameras at one place?")
+        if lacking := [name for name, _ in surfels.items() if name != "means" and not hasattr(settings, name)]:
+            raise ValueError(f"{type(surfels).__name__} has parameters without a learning rate: {', '.join(lacking)}")
         if means_lr_steps < 1:
             raise ValueError(f"means_lr_steps {means_lr_steps} must be at least 1 (schedule.means_lr_steps)")
         self.surfels = surfels
@@ -90,14 +92,7 @@ class SurfelAdam:
         s = self.settings
         share = min(max(step_index / self.means_lr_steps, 0.0), 1.0)
         means = math.exp((1 - share) * math.log(s.means_initial) + share * math.log(s.means_final))
-        return {
-            "means": means * self.extent,
-            "log_scales": s.log_scales,
-            "quaternions": s.quaternions,
-            "opacity_logits": s.opacity_logits,
-            "sh_dc": s.sh_dc,
-            "sh_rest": s.sh_rest,
-        }
+        return {name: means * self.extent if name == "means" else getattr(s, name) for name, _ in self.surfels.items()}
 
     def step(self, step_index: int, sh_degree: int | None = None) -> None:
         """Update every parameter in place from its ``.grad`` (parameters without one are left alone).
@@ -195,5 +190,6 @@ class SurfelAdam:
                 setattr(moments, name, state[f"{prefix}.{name}"].detach().clone().contiguous())
 
 
-def _zeros_like(surfels: Surfels) -> Surfels:
-    return Surfels(**{name: torch.zeros(values.shape, dtype=torch.float32) for name, values in surfels.items()})
+def _zeros_like(surfels: Gaussians) -> Gaussians:
+    zeros = {name: torch.zeros(values.shape, dtype=torch.float32) for name, values in surfels.items()}
+    return type(surfels)(**zeros)

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from surfel_cases import random_surfels
 
 from rtgs.gaussians.activate import activate_surfels
+from rtgs.gaussians.ellipsoids import Ellipsoids
 from rtgs.gaussians.surfels import ActivatedSurfels, Surfels, activate
 from rtgs.native import core
 
@@ -21,7 +22,7 @@ def outputs_of(activated: ActivatedSurfels) -> list[torch.Tensor]:
 
 
 def in_double(surfels: Surfels) -> Surfels:
-    return Surfels(**{name: values.detach().double() for name, values in surfels.items()}).requires_grad_()
+    return type(surfels)(**{name: values.detach().double() for name, values in surfels.items()}).requires_grad_()
 
 
 def upstream_for(outputs: list[torch.Tensor], seed: int = 1) -> list[torch.Tensor]:
@@ -58,8 +59,9 @@ def compare(surfels: Surfels, degree: int, tolerance: float = 1e-5) -> None:
 @pytest.mark.parametrize(
     ("coefficients", "degree"), [(15, 3), (15, 2), (15, 1), (15, 0), (8, 2), (8, 1), (3, 1), (0, 0)]
 )
-def test_matches_twin(isa, coefficients, degree):
-    compare(random_surfels(101, coefficients), degree)
+@pytest.mark.parametrize("kind", [Surfels, Ellipsoids])
+def test_matches_twin(isa, kind, coefficients, degree):
+    compare(random_surfels(101, coefficients, kind=kind), degree)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 15, 16, 17, 33])
@@ -85,7 +87,7 @@ def spoil(surfels: Surfels, row: int, what: str) -> None:
     elif what == "logit":
         surfels.opacity_logits[row] = -80.0 if row % 2 else 80.0
     elif what == "scale":
-        surfels.log_scales[row] = torch.tensor([39.0, -60.0])
+        surfels.log_scales[row] = torch.tensor([39.0, -60.0, 41.0])[: surfels.log_scales.shape[1]]
     elif what == "black":
         surfels.sh_dc[row] = -5.0
 
@@ -99,12 +101,13 @@ def spoil(surfels: Surfels, row: int, what: str) -> None:
     spread=st.floats(0.1, 8),
     degenerate=st.lists(st.sampled_from(["quaternion", "centre", "near", "logit", "scale", "black"]), max_size=4),
     isa=st.sampled_from(core.available_isas()),
+    kind=st.sampled_from([Surfels, Ellipsoids]),
 )
-def test_matches_twin_drawn(seed, count, degree, length, spread, degenerate, isa):
+def test_matches_twin_drawn(seed, count, degree, length, spread, degenerate, isa, kind):
     before = core.isa()
     core.select_isa(isa)
     try:
-        surfels = random_surfels(count, seed=seed)
+        surfels = random_surfels(count, seed=seed, kind=kind)
         with torch.no_grad():
             surfels.quaternions *= 10**length
             surfels.log_scales *= spread
