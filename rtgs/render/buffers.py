@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 from torch import Tensor
 
@@ -58,3 +59,34 @@ class EllipsoidBuffers:
     alpha: Tensor  # (H, W) 1 - T_final
     depth: Tensor | None = None  # (H, W) sum of w * z of the centres, NOT divided by alpha
     weight_sum: Tensor | None = None  # (N,) sum over pixels of w, no gradient
+
+
+@dataclass(frozen=True)
+class TraceOptions:
+    """Cut rules, optional outputs and choices of the surfel ray tracer (docs/tracer.md).
+
+    ``t_min`` and ``t_max`` are one number or one per ray (R,), in units of the ray direction's length.
+    """
+
+    t_min: float | Tensor = 0.0  # hits with t <= t_min do not count
+    t_max: float | Tensor = math.inf  # hits with t >= t_max do not count
+    transmittance_cutoff: float = 1e-4  # the ray stops after the hit that takes T below it (kernels.md, Semantics)
+    alpha_cutoff: float = 1 / 255  # a hit with less alpha is skipped; it also bounds a surfel's support
+    sh_degree: int = 3  # coefficients above it are left out; capped by what the surfels hold
+    depth: bool = False
+    normal: bool = False
+    weight_sum: bool = False
+    direction_gradient: Literal["full", "last_sh"] = "full"  # last_sh: as EnvGS's public tracer (methods.md 0 item 6)
+    order: Literal["auto", "given", "sorted"] = "auto"  # of the rays in the kernel: as given, or by Morton code
+
+
+@dataclass(frozen=True)
+class TraceBuffers:
+    """What R rays met. Optional outputs are None unless asked for, or without the input they need."""
+
+    colors: Tensor | None  # (R, 3) sum of w * max(0, 0.5 + SH(unit direction)); None without sh_dc
+    features: Tensor | None  # (R, C) sum of w * feature; None without features
+    alpha: Tensor  # (R,) sum of w
+    depth: Tensor | None = None  # (R,) sum of w * t, NOT divided by alpha, in units of the direction's length
+    normal: Tensor | None = None  # (R, 3) sum of w * n, each n turned against the ray; not normalised
+    weight_sum: Tensor | None = None  # (N,) sum over rays of w, no gradient
