@@ -1,0 +1,38 @@
+"""Every choice of the specular model, with its source. A plain frozen dataclass: part of the config schema."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+WEIGHTS = ("microfacet", "literal", "split_sum", "envgs")
+REMAPS = ("pbrt", "none")
+MASKINGS = ("correlated", "separable")
+
+
+@dataclass(frozen=True)
+class OpticsSettings:
+    """The weights in front of the traced colours (methods.md 4.2 to 4.4; register rows 1 to 5)."""
+
+    weight: str = (
+        "microfacet"  # or "literal" (paper's blend without the cosine), "split_sum" (its ablation), "envgs" (1)
+    )
+    max_gain: float = 16.0  # S_max: bound of the microfacet gain; 1 conserves energy, 0 = no bound (the paper)
+    remap: str = "pbrt"  # width g(alpha) of the paper, once squared in D and G; "none": g = alpha
+    roughness_floor: float = 1e-3  # argument of g (PBRT): below 1.55e-4 the remap turns round
+    masking: str = "correlated"  # height-correlated Smith; "separable": product of two G1
+    cosine_floor: float = 1e-3  # of n . omega_o
+    literal_cosine_floor: float = 0.1  # the same for "literal", which divides by it
+    detach_cosine: bool = False  # keep the weight's gradient away from the normal
+
+    def __post_init__(self) -> None:
+        for name, legal in (("weight", WEIGHTS), ("remap", REMAPS), ("masking", MASKINGS)):
+            if getattr(self, name) not in legal:
+                raise ValueError(f"method.optics.{name} is {getattr(self, name)!r}: choose one of {', '.join(legal)}")
+        if not (self.max_gain >= 0 and math.isfinite(self.max_gain)):
+            raise ValueError(
+                f"method.optics.max_gain={self.max_gain} must be a finite number of at least 0 (0: no bound)"
+            )
+        for name in ("roughness_floor", "cosine_floor", "literal_cosine_floor"):
+            if not 0 < getattr(self, name) <= 1:
+                raise ValueError(f"method.optics.{name}={getattr(self, name)} must be above 0 and at most 1")
