@@ -55,6 +55,7 @@ def execute(config: RunConfig, choices: Choices) -> RunOutcome:
         CaptureError: the capture cannot be read.
     """
     from pipelines.graph import build_graph, command
+    from pipelines.sweep import prepared_outcomes
     from rtgs.native import core
 
     core.isa()  # an instruction set that RTGS_ISA misspells, or that this CPU lacks, stops here and not in training
@@ -62,6 +63,8 @@ def execute(config: RunConfig, choices: Choices) -> RunOutcome:
     store = Store(config.paths.store)
     remote = remote_store(config)
     plan = make_plan(build_graph(config, choices).targets, store, remote)
+    prepared = prepared_outcomes()
+    prepared.check(plan)
     log.info("%s", describe(plan))
     results, folder = _run(config, choices, _Stores(store, remote), plan, command(choices))
     _show(results, folder)
@@ -72,8 +75,10 @@ def _run(
     config: RunConfig, choices: Choices, stores: _Stores, plan: Plan, command: str
 ) -> tuple[tuple[StepResult, ...], Path]:
     from pipelines.results import run_info, track_end, track_start, write_run_folder
+    from pipelines.sweep import prepared_outcomes
 
-    if plan.complete:  # nothing to record: the tracker saw this run when it was executed
+    executed = prepared_outcomes().executed(plan)
+    if plan.complete and not executed:  # nothing to record: the tracker saw this run when it was executed
         results = InlineExecutor(stores.local).execute(plan)
         return results, write_run_folder(config, choices, command, results)
     tracking = open_tracking(config.tracking.kind, Path(config.paths.root), config.tracking.uri)
@@ -194,6 +199,7 @@ def run_hydra(arguments: Sequence[str]) -> None:
     import hydra
 
     register_schema()
+    _know_own_launcher()
     app = HydraApp()
 
     def task(composed: DictConfig) -> None:
@@ -208,6 +214,15 @@ def run_hydra(arguments: Sequence[str]) -> None:
             print(f"\n{text}")
     if app.error is not None:
         raise app.error
+
+
+def _know_own_launcher() -> None:
+    """Hydra finds plugins by listing folders; an editable installation has none to list."""
+    from hydra.core.plugins import Plugins
+
+    from hydra_plugins.rtgs_dask_launcher import RtgsDaskLauncher
+
+    Plugins.instance().register(RtgsDaskLauncher)
 
 
 @contextmanager

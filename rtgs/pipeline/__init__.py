@@ -2,6 +2,7 @@
 
 from rtgs.pipeline.executors import Executor, InlineExecutor, StepResult
 from rtgs.pipeline.fingerprint import NOT_IN_RECIPE
+from rtgs.pipeline.outcome import StepOutcome, StepUnfinished, SweepOutcomes
 from rtgs.pipeline.plan import Plan, PlannedStep, make_plan, topological
 from rtgs.pipeline.remote import RemoteStore, RemoteStoreError
 from rtgs.pipeline.step import Step, StepContext, StepFailed, StepKind
@@ -20,8 +21,11 @@ __all__ = [
     "StepContext",
     "StepFailed",
     "StepKind",
+    "StepOutcome",
     "StepResult",
+    "StepUnfinished",
     "Store",
+    "SweepOutcomes",
     "make_plan",
     "topological",
 ]

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator
+import traceback
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import Protocol
 from filelock import Timeout
 
 from rtgs.pipeline.fingerprint import flatten
+from rtgs.pipeline.outcome import StepOutcome, SweepOutcomes, blocked
 from rtgs.pipeline.plan import Plan
 from rtgs.pipeline.remote import RemoteStore, RemoteStoreError
 from rtgs.pipeline.step import Step, StepContext, StepFailed
@@ -34,10 +36,10 @@ class StepResult:
 
 
 class Executor(Protocol):
-    """Runs a plan: :class:`InlineExecutor` here, others behind the same method."""
+    """Runs the merged plan of a sweep: :class:`InlineExecutor` here, :mod:`rtgs.pipeline.engine` on many workers."""
 
-    def execute(self, plan: Plan) -> tuple[StepResult, ...]:
-        """Bring every step of the plan into the store; results in the plan's order."""
+    def attempt(self, plan: Plan) -> SweepOutcomes:
+        """Bring every step into the store that can be; one that fails stops only what builds on it."""
         ...
 
 
@@ -59,10 +61,36 @@ class InlineExecutor:
         results: list[StepResult] = []
         for number, planned in enumerate(plan, start=1):
             executed = frozenset(result.step.fingerprint for result in results if result.executed)
-            results.append(self._ensure(planned.step, f"[{number}/{len(plan)}]", executed))
+            results.append(self.ensure(planned.step, f"[{number}/{len(plan)}]", executed))
         return tuple(results)
 
-    def _ensure(self, step: Step, position: str, executed: frozenset[str]) -> StepResult:
+    def attempt(self, plan: Plan) -> SweepOutcomes:
+        """Bring every step into the store that can be; one that fails stops only what builds on it."""
+        done: dict[str, StepOutcome] = {}
+        for number, planned in enumerate(plan, start=1):
+            before = (done[other.fingerprint] for other in planned.step.upstream)
+            done[planned.step.fingerprint] = self.outcome(planned.step, f"[{number}/{len(plan)}]", before)
+        return SweepOutcomes(done)
+
+    def outcome(self, step: Step, position: str, before: Iterable[StepOutcome]) -> StepOutcome:
+        """:meth:`ensure` without an exception; ``before``: outcomes of the steps that ``step`` builds on."""
+        before = tuple(before)
+        if stopped := blocked(step, before):
+            return stopped
+        try:
+            result = self.ensure(step, position, frozenset(one.fingerprint for one in before if one.executed))
+        except StepFailed as error:
+            log.error("%s", error)
+            trace = "".join(traceback.format_exception(error.error))
+            return StepOutcome(step.name, step.fingerprint, None, 0.0, True, str(error), step.fingerprint, trace)
+        return StepOutcome(step.name, step.fingerprint, result.folder, result.duration, result.executed)
+
+    def ensure(self, step: Step, position: str, executed: frozenset[str]) -> StepResult:
+        """Bring one step, whose upstream is here, into the store.
+
+        Raises:
+            StepFailed: the step raised.
+        """
         if artifact := self.store.find(step):
             log.info("%s %s from the cache", position, step.label)
             return _result(step, artifact, executed=False)

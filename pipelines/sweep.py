@@ -1,0 +1,89 @@
+"""A sweep as one plan: the steps of all jobs merged, so that what jobs share runs once."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
+from pathlib import Path
+
+from rtgs.config.schema import Choices, RunConfig
+from rtgs.errors import RtgsError
+from rtgs.pipeline import RemoteStore, Step, Store, SweepOutcomes, make_plan
+from rtgs.pipeline.engine import DaskExecutor, EngineSettings, WorkerJob, open_client
+
+log = logging.getLogger("rtgs")
+_PREPARED: ContextVar[SweepOutcomes | None] = ContextVar("prepared sweep", default=None)
+
+
+@dataclass(frozen=True)
+class SweepJob:
+    """One combination of a sweep."""
+
+    config: RunConfig
+    choices: Choices
+
+
+def run_merged(jobs: Sequence[SweepJob], settings: EngineSettings) -> SweepOutcomes:
+    """Bring the steps of all jobs into the store, each once; a job whose graph cannot be built is left to fail alone.
+
+    Raises:
+        RtgsError: the cluster does not start, or the jobs disagree about where the store is.
+    """
+    from pipelines.app import describe
+    from pipelines.graph import build_graph
+
+    targets: list[Step] = []
+    for job in jobs:
+        try:
+            targets += build_graph(job.config, job.choices).targets
+        except Exception as error:
+            log.debug("left out of the merged plan: %s", error)  # the job itself stops with it
+    if not targets:
+        return SweepOutcomes({})
+    config = _common(jobs)
+    store = Store(config.paths.store)
+    remote = RemoteStore(config.paths.remote) if config.paths.remote else None
+    plan = make_plan(targets, store, remote)
+    log.info("%d jobs, %s", len(jobs), describe(plan))
+    if plan.complete:
+        return SweepOutcomes({})
+    with open_client(settings) as client:
+        return DaskExecutor(client, _worker_job(config, settings)).attempt(plan)
+
+
+def _common(jobs: Sequence[SweepJob]) -> RunConfig:
+    first = jobs[0].config
+    for job in jobs:
+        if (job.config.paths, job.config.tracking) != (first.paths, first.tracking):
+            raise RtgsError("a merged sweep has one store and one tracker: do not sweep over paths or tracking")
+    return first
+
+
+def _worker_job(config: RunConfig, settings: EngineSettings) -> WorkerJob:
+    tracking = config.tracking
+    return WorkerJob(
+        str(config.paths.store),
+        settings.worker_threads,
+        config.paths.remote,
+        tracking.kind,
+        str(Path(config.paths.root)),
+        tracking.uri,
+    )
+
+
+@contextmanager
+def prepared(outcomes: SweepOutcomes) -> Iterator[None]:
+    """Jobs run inside read what the merged plan brought, and stop with the error of the step that failed."""
+    token = _PREPARED.set(outcomes)
+    try:
+        yield
+    finally:
+        _PREPARED.reset(token)
+
+
+def prepared_outcomes() -> SweepOutcomes:
+    """The outcomes of the merged plan this job belongs to; empty outside of one."""
+    return _PREPARED.get() or SweepOutcomes({})

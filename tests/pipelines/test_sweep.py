@@ -1,0 +1,119 @@
+"""``hydra/launcher=rtgs_dask``: the jobs of a sweep as one plan on two worker processes, through the command line."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pipelines.cli import main
+from rtgs.pipeline import Store
+
+QUICK = (
+    "method=2dgs",
+    "preset=smoke",
+    "scene.long_side=24",
+    "scene.points=random",
+    "scene.random_points=150",
+    "schedule.total=6",
+    "schedule.checkpoint_every=3",
+    "schedule.densify_every=5",
+    "hydra/launcher=rtgs_dask",
+    "hydra.launcher.workers=2",
+    "hydra.launcher.threads=1",
+)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory) -> Path:
+    """Nine pictures from cameras in a row."""
+    folder = tmp_path_factory.mktemp("captures") / "row"
+    (folder / "images").mkdir(parents=True)
+    random, frames = np.random.default_rng(3), []
+    for index in range(9):
+        Image.fromarray(random.integers(0, 255, (18, 24, 3), dtype=np.uint8)).save(folder / f"images/{index}.png")
+        pose = np.eye(4)
+        pose[:3, 3] = (0.2 * index, 0.1 * (index % 2), 3.0)
+        frames.append({"file_path": f"images/{index}.png", "transform_matrix": pose.tolist()})
+    lens = {"w": 24, "h": 18, "fl_x": 20.0, "fl_y": 20.0, "cx": 12.0, "cy": 9.0, "camera_model": "PINHOLE"}
+    (folder / "transforms.json").write_text(json.dumps(lens | {"frames": frames}))
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def _in_root(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("RTGS_ROOT", str(tmp_path))
+    handlers, level = logging.root.handlers[:], logging.root.level
+    yield
+    logging.root.handlers[:], logging.root.level = handlers, level
+
+
+def test_a_sweep_is_one_plan_and_every_job_has_its_results(capture, tmp_path, capsys):
+    words = [
+        "run",
+        "--multirun",
+        f"scene={capture}",
+        *QUICK,
+        "tracking=jsonl",
+        "ablation=none,no_normal_loss",
+        "seed=0,1",
+    ]
+    assert main(words) == 0
+    captured = capsys.readouterr()
+    store = Store(tmp_path / "store")
+    counts = {name: len(list(store.artifacts(name))) for name in ("import_scene", "train_diffuse", "report")}
+    assert counts == {"import_scene": 1, "train_diffuse": 4, "report": 4}
+    assert "4 jobs, 17 steps, 0 from the cache" in captured.err
+    assert sorted(path.name for path in (tmp_path / "runs").glob("row*")) == [
+        "row-2dgs-smoke",
+        "row-2dgs-smoke-no_normal_loss",
+        "row-2dgs-smoke-no_normal_loss-seed1",
+        "row-2dgs-smoke-seed1",
+    ]
+    assert captured.out.strip().splitlines()[-5].split()[:2] == ["scene", "method"]
+    first_events = [path.read_text().splitlines()[0] for path in (tmp_path / "tracking").rglob("events.jsonl")]
+    names = [json.loads(line)["name"].split()[0] for line in first_events]
+    assert names.count("train_diffuse") == 4
+    assert sum(name.startswith("row-") for name in names) == 4
+    threads = {artifact.manifest.machine["threads"] for artifact in store.artifacts("train_diffuse")}
+    assert threads == {1}
+
+    assert main(words) == 0
+    assert "17 steps, 17 from the cache, nothing to do" in capsys.readouterr().err
+    assert len(list((tmp_path / "tracking").rglob("events.jsonl"))) == len(first_events)
+
+
+def test_a_failing_job_leaves_the_others_alone_and_says_why(capture, tmp_path, capsys):
+    words = ["run", "--multirun", f"scene={capture}", *QUICK, "tracking=off"]
+    assert main([*words, "schedule.densify_every=0,5"]) == 1
+    captured = capsys.readouterr()
+    assert "1 of 2 jobs failed" in captured.out
+    assert "schedule.densify_every is 0" in captured.out
+    assert (tmp_path / "runs" / "row-2dgs-smoke" / "report.html").is_file()
+
+
+def test_a_job_that_does_not_compose_leaves_the_others_alone(capture, tmp_path, capsys):
+    words = ["run", "--multirun", *QUICK, "tracking=off"]
+    assert main([*words, "scene=capture", f"scene.path={capture},/no/such/folder"]) == 1
+    captured = capsys.readouterr()
+    assert "capture folder /no/such/folder does not exist" in captured.out
+    assert (tmp_path / "runs" / "row-2dgs-smoke" / "report.html").is_file()
+
+
+@pytest.mark.parametrize(
+    ("override", "expected"),
+    [
+        ("hydra.launcher.kind=cloud", "kind='cloud' is unknown"),
+        ("hydra.launcher.worker=3", "worker"),
+        ("tracking=off,jsonl", "do not sweep over paths or tracking"),
+    ],
+)
+def test_mistakes_stop_before_any_work(capture, tmp_path, override, expected, capsys):
+    assert main(["run", "--multirun", f"scene={capture}", *QUICK, override]) == 1
+    assert expected in capsys.readouterr().err
+    assert not list(Store(tmp_path / "store").artifacts("train_diffuse"))
