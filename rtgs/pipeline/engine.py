@@ -204,7 +204,7 @@ def open_client(settings: EngineSettings) -> Iterator[Client]:
 
 
 def _cluster(settings: EngineSettings) -> Any:
-    threads, dashboard = settings.worker_threads, settings.dashboard or None
+    threads = settings.worker_threads
     if settings.kind == "local":
         from distributed import LocalCluster
 
@@ -214,7 +214,8 @@ def _cluster(settings: EngineSettings) -> Any:
             processes=True,
             protocol="tcp",
             host="127.0.0.1",
-            dashboard_address=dashboard,  # type: ignore[arg-type]  # None: no dashboard
+            dashboard_address=settings.dashboard or "127.0.0.1:0",
+            scheduler_kwargs={"dashboard": bool(settings.dashboard)},
             memory_limit=settings.memory,
             env=worker_environment(threads),
         )
@@ -222,7 +223,8 @@ def _cluster(settings: EngineSettings) -> Any:
         from distributed import SSHCluster
 
         nanny = {"nthreads": 1, "n_workers": 1, "memory_limit": settings.memory}
-        return SSHCluster(list(settings.hosts), worker_options=nanny, scheduler_options={"dashboard": bool(dashboard)})
+        scheduler = {"dashboard": bool(settings.dashboard)}
+        return SSHCluster(list(settings.hosts), worker_options=nanny, scheduler_options=scheduler)
     return _slurm(settings, threads)
 
 
