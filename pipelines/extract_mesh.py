@@ -65,10 +65,13 @@ def _depth_views(method: Method, step: int, scene: Scene, params: ExtractMeshPar
     """The depth of every training view, rendered when it is needed."""
     import torch
 
+    from rtgs.errors import RtgsError
     from rtgs.mesh.tsdf import DepthView
     from rtgs.methods import RenderOptions
     from rtgs.train.losses import surface_depth
 
+    if params.depth_ratio > 0 and "median_depth" not in method.maps:
+        raise RtgsError(f"method {method.settings.name} has no median depth: mesh.depth_ratio must be 0")
     options = RenderOptions(depth=True, median_depth=params.depth_ratio > 0)
     for view in scene.train:
         if params.only_masked and view.mask is None:

@@ -32,8 +32,8 @@ def render(params: RenderParams, context: StepContext) -> None:
     """Render every test view.
 
     Writes ``images/<stem>.png`` (8 bit), ``views/<stem>.safetensors`` (float32: image (3, H, W) not clamped, depth
-    (H, W) z-depth divided by alpha in world units, normal (3, H, W) world frame, alpha (H, W)) and ``render.json``
-    (seconds of each image).
+    (H, W) z-depth divided by alpha in world units, normal (3, H, W) world frame where the method has one, alpha (H, W))
+    and ``render.json`` (seconds of each image).
     """
     import torch
     from safetensors.torch import save_file
@@ -54,7 +54,7 @@ def render(params: RenderParams, context: StepContext) -> None:
             seconds[view.name] = time.perf_counter() - start
             tensors = {"image": image.contiguous()}
             if params.maps:
-                options = RenderOptions(depth=True, normal=True)
+                options = RenderOptions(depth=True, normal="normal" in method.maps)
                 tensors |= _maps(method.render(view.camera, stage.until, options))
         save_file(tensors, context.out / "views" / f"{stem}.safetensors")
         write_png(context.out / "images" / f"{stem}.png", to_bytes(image))
@@ -66,10 +66,9 @@ def render(params: RenderParams, context: StepContext) -> None:
 def _maps(rendered: RenderedView) -> dict[str, Tensor]:
     buffers = rendered.buffers
     assert buffers.depth is not None
-    assert buffers.normal is not None
     depth = buffers.depth / buffers.alpha.clamp_min(1e-6)  # the buffer holds the sum of w z
     maps = {"depth": depth, "normal": buffers.normal, "alpha": buffers.alpha}
-    return {name: tensor.contiguous() for name, tensor in maps.items()}
+    return {name: tensor.contiguous() for name, tensor in maps.items() if tensor is not None}
 
 
 def read_render(folder: Path, view_name: str) -> dict[str, Tensor]:

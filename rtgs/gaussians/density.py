@@ -1,8 +1,9 @@
 """Density control: where surfels are cloned, split and pruned, and how a change of N reaches everything that has rows.
 
-The rules are those of 2DGS and EnvGS (methods.md 6.1, 12). Each surfel meets at most one of them in a call, in this
-order: transparent -> pruned; too large -> pruned or split into 5; high signal and large -> split into 2; high signal
-and small -> cloned. The cap on N comes last.
+The rules are those of 3DGS, 2DGS and EnvGS (methods.md 6.1, 12), their differences are settings; ellipsoids meet the
+same ones as surfels. Each surfel meets at most one of them in a call, in this order: transparent -> pruned; too large
+-> pruned or split into 5; high signal and large -> split into 2; high signal and small -> cloned. The cap on N comes
+last.
 """
 
 from __future__ import annotations
@@ -86,6 +87,9 @@ class DensityControl:
     A surfel is visible in a step if its weight sum is positive or its signal is not zero; means are over those steps.
     """
 
+    needs_signal = True  # of every training view
+    resets_opacity = True
+
     def __init__(self, settings: DensitySettings, extent: float) -> None:
         """``extent`` of the scene in world units, which the size thresholds are relative to."""
         if not (math.isfinite(extent) and extent > 0):
@@ -155,19 +159,24 @@ class DensityControl:
         return self.weight_sum / self.visible_steps.clamp_min(1)
 
     @torch.no_grad()
-    def densify(self, surfels: Gaussians, optimizer: SurfelAdam, generator: torch.Generator) -> DensityReport:
+    def densify(
+        self, surfels: Gaussians, optimizer: SurfelAdam, generator: torch.Generator, *, after_reset: bool = True
+    ) -> DensityReport:
         """Clone, split and prune; the statistics start afresh. Without an observed step only pruning and splitting by
-        opacity and size happen."""
+        opacity and size happen.
+
+        ``after_reset``: opacities have been reset before (``settings.too_large_after_reset`` waits for that).
+        """
         if not len(self.visible_steps):
             self._clear(len(surfels))
         s = self.settings
         size = surfels.log_scales.detach().exp().amax(dim=1)
         high_signal = (self.visible_steps > 0) & (self.mean_signal >= s.gradient_threshold)
         transparent = surfels.opacity_logits.detach() < logit(s.min_opacity)
-        too_large = (
-            ~transparent & (size > s.too_large * self.extent) if s.too_large > 0 else torch.zeros_like(transparent)
-        )
-        too_large_pruned = too_large & self._lowest_weights(s.low_weight_share)
+        too_large = torch.zeros_like(transparent)
+        if s.too_large > 0 and (after_reset or not s.too_large_after_reset):
+            too_large = ~transparent & (size > s.too_large * self.extent)
+        too_large_pruned = too_large if s.too_large_pruned else too_large & self._lowest_weights(s.low_weight_share)
         too_large_split = too_large & ~too_large_pruned
         rest = high_signal & ~transparent & ~too_large
         if s.cap_turnover is not None:
@@ -222,6 +231,9 @@ class DensityControl:
         stays[weights.argsort(stable=True)[:excess]] = False
         kept = len(plan.keep)
         return RowPlan(plan.keep[stays[:kept]], select_rows(plan.added, stays[kept:])), excess
+
+    def perturb(self, surfels: Gaussians, means_rate: float, generator: torch.Generator) -> None:
+        """What happens to the means after a step of Adam at ``means_rate``, world units: nothing."""
 
     @torch.no_grad()
     def reset_opacity(self, surfels: Gaussians, optimizer: SurfelAdam) -> None:

@@ -18,6 +18,8 @@ class Ellipsoids(Gaussians):
     the third axis is tangent_u x tangent_v.
     """
 
+    axis_count = 3
+
     def axes(self) -> Tensor:
         tangent_u, tangent_v = tangents(self.quaternions)
         return torch.stack((tangent_u, tangent_v, torch.linalg.cross(tangent_u, tangent_v, dim=1)), dim=1)

@@ -1,8 +1,9 @@
-"""Initial surfels: from a point cloud, or from random points in a box (methods.md section 2)."""
+"""Initial surfels and ellipsoids: from a point cloud, or from random points in a box (methods.md section 2)."""
 
 from __future__ import annotations
 
 import math
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -11,11 +12,13 @@ from torch import Tensor
 
 from rtgs.errors import RtgsError
 from rtgs.gaussians.harmonics import rest_count, rgb_to_sh_dc
+from rtgs.gaussians.primitives import Gaussians
 from rtgs.gaussians.surfels import Surfels
 from rtgs.train.settings import InitSettings
 
 SMALLEST_SQUARED_DISTANCE = 1e-7  # world units squared: the scale of duplicate points
 BOX_QUANTILES = (0.005, 0.995)  # per axis: the scene box without far outliers (methods.md 6.1)
+Kind = TypeVar("Kind", bound=Gaussians)
 
 
 def surfels_from_points(
@@ -26,19 +29,33 @@ def surfels_from_points(
     *,
     box: Tensor | None = None,
 ) -> Surfels:
-    """One surfel for each point: scale from its neighbours, random orientation, colour from the point.
+    """One surfel for each point (:func:`gaussians_from_points`)."""
+    return gaussians_from_points(Surfels, points, colors, settings, generator, box=box)
+
+
+def gaussians_from_points(
+    kind: type[Kind],
+    points: Tensor,
+    colors: Tensor,
+    settings: InitSettings,
+    generator: torch.Generator,
+    *,
+    box: Tensor | None = None,
+) -> Kind:
+    """One Gaussian for each point: round, scale from its neighbours, colour from the point, orientation random or none.
 
     Points with a NaN or inf coordinate are left out. With ``settings.random_points`` > 0 the points are replaced by
     that many uniform random ones of random colour in ``box``, or else in the box of the points.
 
     Args:
+        kind: ``Surfels`` or ``Ellipsoids``.
         points: (P, 3) world.
         colors: (P, 3) in 0..1.
         generator: draws the orientations (and the random points).
         box: (2, 3) lowest and highest corner, world; only for random points.
 
     Returns:
-        Surfels that require gradients, float32.
+        Gaussians that require gradients, float32.
 
     Raises:
         RtgsError: there are fewer usable points than ``settings.min_points``.
@@ -48,6 +65,8 @@ def surfels_from_points(
         raise ValueError(f"points and colors must both be (P, 3), got {tuple(points.shape)} and {tuple(colors.shape)}")
     if not 0 < settings.opacity < 1:
         raise ValueError(f"init.opacity {settings.opacity} must be between 0 and 1")
+    if not settings.scale > 0:
+        raise ValueError(f"init.scale {settings.scale} must be positive")
     usable = torch.isfinite(points).all(dim=1) & torch.isfinite(colors).all(dim=1)
     points, colors = points[usable].float(), colors[usable].float().clamp(0, 1)
     if settings.random_points > 0:
@@ -60,11 +79,14 @@ def surfels_from_points(
             "check the reconstruction (are the images registered?), or ask for random points: init.random_points=20000"
         )
     count = len(points)
-    scale = neighbor_distance(points, settings.neighbors)
-    quaternions = torch.rand(count, 4, generator=generator)
-    return Surfels(
+    scale = settings.scale * neighbor_distance(points, settings.neighbors)
+    if settings.random_rotation:
+        quaternions = torch.rand(count, 4, generator=generator)
+    else:
+        quaternions = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1)
+    return kind(
         means=points.clone().contiguous(),
-        log_scales=scale.log()[:, None].repeat(1, 2),
+        log_scales=scale.log()[:, None].repeat(1, kind.axis_count),
         quaternions=quaternions,
         opacity_logits=torch.full((count,), math.log(settings.opacity / (1 - settings.opacity))),
         sh_dc=rgb_to_sh_dc(colors),

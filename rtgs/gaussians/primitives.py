@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
-from typing import Self
+from typing import ClassVar, Self
 
 import torch
 from torch import Tensor
@@ -17,6 +17,8 @@ from torch import Tensor
 @dataclass
 class Gaussians:
     """N Gaussians. Raw (unconstrained) parameters (methods.md section 2)."""
+
+    axis_count: ClassVar[int]  # S: scales a Gaussian has
 
     means: Tensor  # (N, 3) world
     log_scales: Tensor  # (N, S) log of the standard deviations along the axes, world units

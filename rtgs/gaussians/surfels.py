@@ -15,6 +15,8 @@ from rtgs.gaussians.primitives import LOG_SCALE_LIMIT, SHORTEST, Gaussians, tang
 class Surfels(Gaussians):
     """N surfels: two scales along columns 0 and 1 of the rotation (the tangents), normal column 2."""
 
+    axis_count = 2
+
     def axes(self) -> Tensor:
         return torch.stack(tangents(self.quaternions), dim=1)
 

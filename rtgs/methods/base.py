@@ -88,6 +88,7 @@ class Method(Protocol):
     settings: MethodSettings
     schedule: ScheduleSettings
     stages: tuple[Stage, ...]
+    maps: tuple[str, ...]  # of RenderOptions, those that render() can give
     decisions: tuple[Decision, ...]
 
     @property

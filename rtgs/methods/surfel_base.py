@@ -10,7 +10,9 @@ from torch import Tensor
 
 from rtgs.cameras import Camera
 from rtgs.errors import RtgsError
-from rtgs.gaussians.initialize import surfels_from_points
+from rtgs.gaussians.initialize import gaussians_from_points
+from rtgs.gaussians.primitives import Gaussians
+from rtgs.gaussians.surfels import Surfels
 from rtgs.methods.base import Decision, LossTerm, LossTerms, RenderedView, RenderOptions, Stage, StepEvent
 from rtgs.methods.surfel_set import SurfelSet
 from rtgs.render.buffers import RasterBuffers, RasterOptions
@@ -23,7 +25,15 @@ from rtgs.train.losses import (
     photometric_loss,
     surface_depth,
 )
-from rtgs.train.schedule import check_schedule, densify_ahead, densify_due, loss_start, opacity_reset_due, sh_degree_at
+from rtgs.train.schedule import (
+    check_schedule,
+    densify_ahead,
+    densify_due,
+    loss_start,
+    opacity_reset_due,
+    opacity_was_reset,
+    sh_degree_at,
+)
 from rtgs.train.settings import MethodSettings, ScheduleSettings
 
 if TYPE_CHECKING:
@@ -46,8 +56,11 @@ def _on(start: int | None, step: int) -> bool:
 class SurfelMethod:
     """A base set of surfels from the scene's points, rendered by rasterisation (methods.md 3.1).
 
-    Subclasses add sets, shading and stages; this class alone is 2DGS.
+    Subclasses add sets, shading and stages, or change the kind of Gaussian; this class alone is 2DGS.
     """
+
+    kind: type[Gaussians] = Surfels
+    maps: tuple[str, ...] = ("depth", "median_depth", "normal", "distortion")  # that :meth:`render` can give
 
     def __init__(
         self, settings: MethodSettings, scene: Scene, schedule: ScheduleSettings, generator: torch.Generator
@@ -59,7 +72,7 @@ class SurfelMethod:
         self.extent = scene.extent
         self.base = SurfelSet(
             "base",
-            surfels_from_points(scene.points, scene.point_colors, settings.init, generator),
+            gaussians_from_points(self.kind, scene.points, scene.point_colors, settings.init, generator),
             optimizer=settings.optimizer,
             density=settings.density,
             means_lr_steps=schedule.means_lr_steps,
@@ -67,7 +80,7 @@ class SurfelMethod:
         )
         self.stages = self.declare_stages(schedule)
         self.starts, decisions = _decide_losses(settings, scene, schedule)
-        self.decisions: tuple[Decision, ...] = decisions
+        self.decisions: tuple[Decision, ...] = (*decisions, *_decide_density(settings, schedule))
         self._background = torch.tensor(settings.render.background)
 
     @staticmethod
@@ -101,7 +114,7 @@ class SurfelMethod:
 
     def rasterize_base(self, camera: Camera, step: int, options: RenderOptions | None) -> RasterBuffers:
         """Rasterise the base set: its SH colours as features."""
-        watched = options is None and densify_ahead(self.schedule, step)
+        watched = self.watched(step, options)
         wanted = self.training_options(step) if options is None else options
         surfels = self.base.activated(camera.center.float(), self.sh_degree(step))
         probe = self.base.new_probe() if watched else None
@@ -120,6 +133,10 @@ class SurfelMethod:
         if probe is not None and buffers.weight_sum is not None:
             self.base.watch(probe, buffers.weight_sum)
         return buffers
+
+    def watched(self, step: int, options: RenderOptions | None) -> bool:
+        """Whether density control learns from a view rendered with these options at this step."""
+        return options is None and self.base.density.needs_signal and densify_ahead(self.schedule, step)
 
     def raster_options(self, wanted: RenderOptions, *, weight_sum: bool) -> RasterOptions:
         """The rasteriser's options: near and far in world units of this scene."""
@@ -154,6 +171,10 @@ class SurfelMethod:
         if _on(self.starts.distortion, step):
             assert buffers.distortion is not None
             add("distortion", distortion_loss(buffers.distortion), weights.distortion)
+        if weights.opacity > 0:
+            add("opacity", self.base.surfels.opacity_logits.sigmoid().mean(), weights.opacity)
+        if weights.scale > 0:
+            add("scale", self.base.surfels.log_scales.exp().mean() / self.extent, weights.scale)
         return LossTerms(total, tuple(terms))
 
     def _normal_consistency(self, buffers: RasterBuffers, camera: Camera) -> Tensor:
@@ -187,10 +208,11 @@ class SurfelMethod:
             RtgsError: density control left no surfel.
         """
         self.base.step(step, self.sh_degree(step))
+        self.base.perturb(step, self.generator)
         following = step + 1
         events = []
         if densify_due(self.schedule, following):
-            report = self.base.densify(self.generator)
+            report = self.base.densify(self.generator, after_reset=opacity_was_reset(self.schedule, following))
             if report.total == 0:
                 raise RtgsError(
                     f"density control removed all {report.pruned} surfels of set {self.base.name!r} before step "
@@ -200,7 +222,7 @@ class SurfelMethod:
                 )
             detail = f"{report.cloned} cloned, {report.split} split, {report.pruned} pruned, {report.total} surfels"
             events.append(StepEvent("density", self.base.name, detail))
-        if opacity_reset_due(self.schedule, following):
+        if self.base.density.resets_opacity and opacity_reset_due(self.schedule, following):
             self.base.reset_opacity()
             detail = f"opacities lowered to {self.settings.density.reset_opacity}"
             events.append(StepEvent("opacity_reset", self.base.name, detail))
@@ -254,3 +276,11 @@ def _decide_losses(
             )
         )
     return LossStarts(normal, mono, distortion), tuple(decisions)
+
+
+def _decide_density(settings: MethodSettings, schedule: ScheduleSettings) -> tuple[Decision, ...]:
+    """What density control leaves out in this run."""
+    decisions = []
+    if settings.density.strategy == "mcmc" and schedule.opacity_reset_every:
+        decisions.append(Decision("no opacity resets", "density.strategy mcmc moves what is transparent instead"))
+    return tuple(decisions)

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from rtgs.gaussians.activate import activate_surfels
-from rtgs.gaussians.density import DensityControl, DensityReport
+from rtgs.gaussians.density import DensityReport
+from rtgs.gaussians.mcmc import density_control
 from rtgs.gaussians.primitives import Gaussians
 from rtgs.gaussians.surfels import ActivatedSurfels
 from rtgs.train.adam import SurfelAdam
@@ -25,7 +26,7 @@ class Observation:
 
 
 class SurfelSet:
-    """Gaussians of one kind + :class:`SurfelAdam` + :class:`DensityControl`, kept consistent through every change of N.
+    """Gaussians of one kind + :class:`SurfelAdam` + density control, kept consistent through every change of N.
 
     ``name`` prefixes its tensors in a checkpoint and its lines in reports; ``extent`` is the scene's, world units.
     """
@@ -46,7 +47,7 @@ class SurfelSet:
         self._optimizer_settings = optimizer
         self._means_lr_steps = means_lr_steps
         self.optimizer = self._new_optimizer()
-        self.density = DensityControl(density, extent)
+        self.density = density_control(density, extent)
         self._observation: Observation | None = None
 
     def __len__(self) -> int:
@@ -82,9 +83,16 @@ class SurfelSet:
         self.optimizer.zero_grad()
         self._clamp()
 
-    def densify(self, generator: torch.Generator) -> DensityReport:
-        """Clone, split, prune with the signal gathered since the last call."""
-        return self.density.densify(self.surfels, self.optimizer, generator)
+    def perturb(self, step: int, generator: torch.Generator) -> None:
+        """The noise that density control puts on the means after a step, at that step's learning rate."""
+        self.density.perturb(self.surfels, self.optimizer.learning_rates(step)["means"], generator)
+
+    def densify(self, generator: torch.Generator, *, after_reset: bool = True) -> DensityReport:
+        """Clone, split, prune with the signal gathered since the last call.
+
+        ``after_reset``: opacities have been reset before.
+        """
+        return self.density.densify(self.surfels, self.optimizer, generator, after_reset=after_reset)
 
     def reset_opacity(self) -> None:
         """Lower every opacity to the settings' reset value."""

@@ -55,6 +55,12 @@ def opacity_reset_due(schedule: ScheduleSettings, step: int) -> bool:
     return every > 0 and 0 < step < densify_end(schedule) and step % every == 0
 
 
+def opacity_was_reset(schedule: ScheduleSettings, step: int) -> bool:
+    """Whether the first opacity reset lies before ``step``."""
+    every = schedule.opacity_reset_every
+    return 0 < every < min(step, densify_end(schedule))
+
+
 def loss_start(share: float, total: int) -> int:
     """First step of a loss term that starts after ``share`` of a run of ``total`` steps."""
     return round(share * total)

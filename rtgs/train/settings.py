@@ -62,15 +62,38 @@ class LossSettings:
     mono_normal_form: str = "cosine"  # "cosine" (paper: 1 - n.N) or "envgs" (|difference|_1 + 1 - cos)
     distortion: float = 0.0  # 2DGS: 0 unbounded, 1000 bounded
     distortion_start: float = 0.1  # 2DGS: from 3,000 of 30,000
+    # Means over all Gaussians, from the first step (Kheradmand et al. 2024, equation 10: 0.01 each).
+    opacity: float = 0.0
+    scale: float = 0.0  # of the standard deviations, in units of the scene extent
 
     def __post_init__(self) -> None:
         _refuse_bad_numbers(self, "method.loss")
 
 
 @dataclass(frozen=True)
+class McmcSettings:
+    """Densification as Markov chain Monte Carlo (Kheradmand et al. 2024), with a fixed budget: ``max_surfels``."""
+
+    growth: float = 0.05  # at most this share more Gaussians a call, until the budget is reached (their section 4.2)
+    # Langevin noise on the means: covariance / extent^2 x standard normal x rate of the means x noise x
+    # sigmoid(sharpness (border - opacity)), so that only the nearly transparent wander (their equation 8 and code).
+    # Their 5e5 is for a covariance in world units of COLMAP scenes, whose extent is about 5: 25 times that here.
+    noise: float = 1.25e7
+    noise_sharpness: float = 100.0
+    noise_border: float = 0.005
+
+    def __post_init__(self) -> None:
+        _refuse_bad_numbers(self, "method.density.mcmc")
+
+
+DENSITY_STRATEGIES = ("adaptive", "mcmc")
+
+
+@dataclass(frozen=True)
 class DensitySettings:
     """Density control (methods.md 6.1, 12)."""
 
+    strategy: str = "adaptive"  # or "mcmc": a fixed budget, no signal, no opacity resets
     gradient_threshold: float = 2e-4  # mean norm of the densification signal (NDC)
     size_border: float = 0.01  # times extent: larger surfels split, smaller ones clone
     split_count: int = 2
@@ -79,6 +102,8 @@ class DensitySettings:
     too_large: float = 0.1  # times extent; 0 = never
     too_large_split_count: int = 5
     too_large_shrink: float = 2.5
+    too_large_pruned: bool = False  # 3DGS: too large means pruned (else split, EnvGS) ...
+    too_large_after_reset: bool = False  # 3DGS: ... and only after the first opacity reset
     low_weight_share: float = 0.1  # too large and among the lowest 10 % of mean weight: pruned instead of split
     reset_opacity: float = 0.01
     max_surfels: int = 2_000_000
@@ -87,13 +112,21 @@ class DensitySettings:
     # number, as in EnvGS, which hardly meets its cap; presets with a small cap set it, or half of their set would
     # change every call.
     cap_turnover: float | None = None
+    mcmc: McmcSettings = field(default_factory=McmcSettings)
+
+    def __post_init__(self) -> None:
+        if self.strategy not in DENSITY_STRATEGIES:
+            known = ", ".join(DENSITY_STRATEGIES)
+            raise ValueError(f"method.density.strategy={self.strategy!r} must be one of {known}")
 
 
 @dataclass(frozen=True)
 class InitSettings:
     """Initial surfels from points (methods.md 2)."""
 
-    opacity: float = 0.1
+    opacity: float = 0.1  # MCMC 0.5
+    scale: float = 1.0  # times the distance to the neighbours; MCMC 0.1
+    random_rotation: bool = True  # 2DGS and EnvGS; 3DGS starts from the identity
     sh_degree: int = 3
     neighbors: int = 3
     min_points: int = 10  # fewer usable points than this: the capture is refused (or random points, if asked for)
@@ -124,6 +157,12 @@ class RenderSettings:
     far: float = 20.0  # times the scene extent; distortion mapping only
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     depth_ratio: float = 0.0  # 0 expected depth (unbounded), 1 median depth (bounded objects)
+    # Ellipsoids only (methods.md 12):
+    dilation: float = 0.3  # px^2 added to the projected covariance
+    antialiased: bool = False  # the dilated footprint keeps its weight (Mip-Splatting's 2D filter)
+
+    def __post_init__(self) -> None:
+        _refuse_bad_numbers(self, "method.render")
 
 
 @dataclass(frozen=True)

@@ -170,7 +170,7 @@ def test_nan_in_the_file(written, bad):
         return vertices
 
     rewrite(written, spoil)
-    with pytest.raises(ValueError, match="NaN or inf in rot_0, rot_1, rot_2, rot_3 of 1 vertices, the first 4"):
+    with pytest.raises(ValueError, match="NaN or inf in quaternions of 1 of 7 vertices, the first 4"):
         read_ply(written)
 
 
