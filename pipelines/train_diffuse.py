@@ -13,7 +13,7 @@ def train_diffuse(params: StageParams, context: StepContext) -> None:
 
 STEP = StepKind(
     "train_diffuse",
-    2,
+    3,
     train_diffuse,
     helpers=(
         "pipelines.training",
@@ -25,6 +25,8 @@ STEP = StepKind(
         "rtgs.train.adam",
         "rtgs.gaussians.initialize",
         "rtgs.gaussians.density",
+        "rtgs.gaussians.mcmc",
+        "rtgs.gaussians.primitives",
         "rtgs.gaussians.activate",
         "rtgs.gaussians.ply",
         "rtgs.render.rasterize",
