@@ -9,4 +9,5 @@ NB_MODULE(_core, m) {
   rtgs::bind_surfels(m);
   rtgs::bind_optimizer(m);
   rtgs::bind_raster(m);
+  rtgs::bind_trace(m);
 }

@@ -10,14 +10,19 @@ set(RTGS_KERNELS
   project_backward.cpp
   raster_bins.cpp
   raster_forward.cpp
-  raster_backward.cpp)
+  raster_backward.cpp
+  bvh_boxes.cpp
+  trace_records.cpp
+  trace_forward.cpp)
 set(RTGS_BINDINGS
   module.cpp
   isa.cpp
   bind_image.cpp
   bind_surfels.cpp
   bind_optimizer.cpp
-  bind_raster.cpp)
+  bind_raster.cpp
+  bvh_tree.cpp
+  bind_trace.cpp)
 
 set(RTGS_ISAS portable)
 set(RTGS_FLAGS_portable "")

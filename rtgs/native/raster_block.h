@@ -85,19 +85,6 @@ static inline Response respond(const float* record, vfloat x, vfloat y) {
   return r;
 }
 
-// 2^x, relative error 1e-7, for x <= 127; below 2^-100 it may stop falling.
-static inline vfloat exp2_response(vfloat x) {
-  if (kLanes < 16) x = max(x, broadcast(-100.f));  // the AVX-512 instruction takes any exponent
-  vfloat f = fraction(x);
-  vfloat p = broadcast(0.0018775766948238015f);  // minimax polynomial of 2^f on [0, 1)
-  p = fma(p, f, broadcast(0.00898933969438076f));
-  p = fma(p, f, broadcast(0.05582631751894951f));
-  p = fma(p, f, broadcast(0.24015361070632935f));
-  p = fma(p, f, broadcast(0.6931530833244324f));
-  p = fma(p, f, broadcast(0.9999999403953552f));
-  return scale_by_power(p, kLanes < 16 ? x - f : x);
-}
-
 static inline vmask shows(const Response& r, vfloat transmittance) {
   return ge(r.exponent, broadcast(kLog2MinAlpha)) & ge(transmittance, broadcast(kMinTransmittance));
 }

@@ -58,21 +58,22 @@ struct RasterMemory {
   Buffer<uint64_t> masks;
 };
 
-// Idle memory, shared by all threads of the process.
-class RasterMemoryPool {
+// Idle memory of one kind, shared by all threads of the process.
+template <class Memory>
+class MemoryPool {
  public:
-  static RasterMemoryPool& instance() {
-    static RasterMemoryPool pool;
+  static MemoryPool& instance() {
+    static MemoryPool pool;
     return pool;
   }
-  std::unique_ptr<RasterMemory> take() {
+  std::unique_ptr<Memory> take() {
     std::lock_guard<std::mutex> lock(mutex_);
-    if (idle_.empty()) return std::make_unique<RasterMemory>();
+    if (idle_.empty()) return std::make_unique<Memory>();
     auto memory = std::move(idle_.back());
     idle_.pop_back();
     return memory;
   }
-  void give(std::unique_ptr<RasterMemory> memory) {
+  void give(std::unique_ptr<Memory> memory) {
     std::lock_guard<std::mutex> lock(mutex_);
     if (memory && idle_.size() < kMostIdle) idle_.push_back(std::move(memory));
   }
@@ -84,7 +85,8 @@ class RasterMemoryPool {
  private:
   static constexpr size_t kMostIdle = 2;
   std::mutex mutex_;
-  std::vector<std::unique_ptr<RasterMemory>> idle_;
+  std::vector<std::unique_ptr<Memory>> idle_;
 };
+using RasterMemoryPool = MemoryPool<RasterMemory>;
 
 }  // namespace rtgs

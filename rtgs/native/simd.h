@@ -74,6 +74,14 @@ static inline vfloat fraction(vfloat a) { return (vfloat)_mm512_reduce_ps((__m51
 static inline vfloat sqrt(vfloat a) { return (vfloat)_mm512_sqrt_round_ps((__m512)a, 8); }
 static inline vfloat scale_by_power(vfloat a, vfloat n) { return (vfloat)_mm512_scalef_ps((__m512)a, (__m512)n); }
 static inline vfloat gather(const float* p, vint index) { return (vfloat)_mm512_i32gather_ps((__m512i)index, p, 4); }
+static inline vint gather_int(const int32_t* p, vint index) { return (vint)_mm512_i32gather_epi32((__m512i)index, p, 4); }
+static inline void scatter(float* p, vint index, vfloat v, vmask m) { _mm512_mask_i32scatter_ps(p, m, (__m512i)index, (__m512)v, 4); }
+static inline void scatter_int(int32_t* p, vint index, vint v, vmask m) {
+  _mm512_mask_i32scatter_epi32(p, m, (__m512i)index, (__m512i)v, 4);
+}
+static inline vint min_int(vint a, vint b) { return (vint)_mm512_min_epi32((__m512i)a, (__m512i)b); }
+static inline vint max_int(vint a, vint b) { return (vint)_mm512_max_epi32((__m512i)a, (__m512i)b); }
+static inline float smallest(vfloat a) { return _mm512_reduce_min_ps((__m512)a); }
 static inline vfloat load_first(const float* p, int count) { return (vfloat)_mm512_maskz_loadu_ps(first_lanes(count), p); }
 static inline void store_first(float* p, vfloat v, int count) { _mm512_mask_storeu_ps(p, first_lanes(count), (__m512)v); }
 // 1/a within 1.5 ulp for normal a (estimate and one Newton step); a = 0 or inf gives NaN.
@@ -109,6 +117,14 @@ static inline vfloat scale_by_power(vfloat a, vfloat n) {  // n whole; result a 
   return a * (vfloat)_mm256_castsi256_ps(_mm256_add_epi32(e, _mm256_set1_epi32(127 << 23)));
 }
 static inline vfloat gather(const float* p, vint index) { return (vfloat)_mm256_i32gather_ps(p, (__m256i)index, 4); }
+static inline vint gather_int(const int32_t* p, vint index) { return (vint)_mm256_i32gather_epi32(p, (__m256i)index, 4); }
+static inline vint min_int(vint a, vint b) { return (vint)_mm256_min_epi32((__m256i)a, (__m256i)b); }
+static inline vint max_int(vint a, vint b) { return (vint)_mm256_max_epi32((__m256i)a, (__m256i)b); }
+static inline float smallest(vfloat a) {
+  __m128 q = _mm_min_ps(_mm256_castps256_ps128((__m256)a), _mm256_extractf128_ps((__m256)a, 1));
+  q = _mm_min_ps(q, _mm_movehl_ps(q, q));
+  return _mm_cvtss_f32(_mm_min_ss(q, _mm_movehdup_ps(q)));
+}
 static inline vfloat load_first(const float* p, int count) {
   return (vfloat)_mm256_maskload_ps(p, (__m256i)first_lanes(count));
 }
@@ -150,6 +166,13 @@ static inline vfloat sqrt(vfloat a) {
 }
 static inline vfloat scale_by_power(vfloat a, vfloat n) { return a * (vfloat)((truncate(n) + 127) << 23); }
 static inline vfloat gather(const float* p, vint index) { return vfloat{p[index[0]], p[index[1]], p[index[2]], p[index[3]]}; }
+static inline vint gather_int(const int32_t* p, vint index) { return vint{p[index[0]], p[index[1]], p[index[2]], p[index[3]]}; }
+static inline vint min_int(vint a, vint b) { return select_int(a < b, a, b); }
+static inline vint max_int(vint a, vint b) { return select_int(a > b, a, b); }
+static inline float smallest(vfloat a) {
+  const float p = a[0] < a[1] ? a[0] : a[1], q = a[2] < a[3] ? a[2] : a[3];
+  return p < q ? p : q;
+}
 static inline vfloat load_first(const float* p, int count) {
   vfloat v{};
   for (int lane = 0; lane < kLanes; ++lane)
@@ -168,6 +191,39 @@ static inline vmask lt(vfloat a, vfloat b) { return gt(b, a); }
 static inline vmask le(vfloat a, vfloat b) { return ge(b, a); }
 static inline vfloat abs(vfloat a) { return (vfloat)((vint)a & 0x7fffffff); }
 static inline vfloat clamp(vfloat a, float low, float high) { return min(max(a, broadcast(low)), broadcast(high)); }
+
+#if !defined(__AVX512F__)
+// p[index[lane]] = v[lane] where m; of lanes with the same index the last one stays.
+static inline void scatter(float* p, vint index, vfloat v, vmask m) {
+  for (uint32_t lanes = mask_bits(m); lanes; lanes &= lanes - 1) p[index[__builtin_ctz(lanes)]] = v[__builtin_ctz(lanes)];
+}
+static inline void scatter_int(int32_t* p, vint index, vint v, vmask m) {
+  for (uint32_t lanes = mask_bits(m); lanes; lanes &= lanes - 1) p[index[__builtin_ctz(lanes)]] = v[__builtin_ctz(lanes)];
+}
+#endif
+static inline vfloat negated_where(vmask m, vfloat a) { return (vfloat)((vint)a ^ select_int(m, broadcast_int(INT32_MIN), broadcast_int(0))); }
+static inline float largest(vfloat a) { return -smallest(-a); }
+static inline vmask lanes_from_bits(uint32_t bits) {
+#if defined(__AVX512F__)
+  return vmask(bits);
+#else
+  vint m;
+  for (int lane = 0; lane < kLanes; ++lane) m[lane] = bits >> lane & 1 ? -1 : 0;
+  return m;
+#endif
+}
+
+// 16-bit integers, one per lane.
+typedef uint16_t vshort __attribute__((vector_size(2 * kLanes)));
+static inline void store_short(uint16_t* p, vint a) {
+  const vshort v = __builtin_convertvector(a, vshort);
+  memcpy(p, &v, sizeof v);
+}
+static inline vint load_short(const uint16_t* p) {
+  vshort v;
+  memcpy(&v, p, sizeof v);
+  return __builtin_convertvector(v, vint);
+}
 
 // Lane k = p[k * stride]: one component of kLanes consecutive rows.
 static inline vfloat load_strided(const float* p, int stride) { return gather(p, truncate(lane_numbers()) * stride); }
@@ -188,6 +244,19 @@ static inline vfloat exp(vfloat a) {
   return scale_by_power(p, n);
 }
 static inline vfloat sigmoid(vfloat a) { return 1.f / (1.f + exp(-a)); }
+
+// 2^x, relative error 1e-7, for x <= 127; below 2^-100 it may stop falling.
+static inline vfloat exp2_response(vfloat x) {
+  if (kLanes < 16) x = max(x, broadcast(-100.f));  // the AVX-512 instruction takes any exponent
+  vfloat f = fraction(x);
+  vfloat p = broadcast(0.0018775766948238015f);  // minimax polynomial of 2^f on [0, 1)
+  p = fma(p, f, broadcast(0.00898933969438076f));
+  p = fma(p, f, broadcast(0.05582631751894951f));
+  p = fma(p, f, broadcast(0.24015361070632935f));
+  p = fma(p, f, broadcast(0.6931530833244324f));
+  p = fma(p, f, broadcast(0.9999999403953552f));
+  return scale_by_power(p, kLanes < 16 ? x - f : x);
+}
 
 // True where a is neither NaN nor infinite (on the bits: fast-math cannot fold it).
 static inline vmask finite(vfloat a) { return gt_int(broadcast_int(0x7f800000), (vint)a & 0x7fffffff); }
