@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from rtgs.gaussians.harmonics import MAX_DEGREE, rest_count
@@ -55,16 +56,15 @@ def check_trace_shapes(
 
     ``surfels``: means, tangent_u, tangent_v, scales, opacities by name.
     """
-    count, rays = _rows(surfels["means"]), _rows(origins)
+    check_tree_shapes(surfels, options.alpha_cutoff)
+    count, rays = len(surfels["means"]), _rows(origins)
     channels = features.shape[1] if features is not None and features.ndim == 2 else 0
     if features is not None and not 1 <= channels <= MAX_CHANNELS:
         raise ValueError(f"features must be (N, C) with 1 <= C <= {MAX_CHANNELS}, got {tuple(features.shape)}")
     if sh_rest is not None and sh_dc is None:
         raise ValueError("sh_rest is given without sh_dc; pass both, or sh_dc alone for degree 0")
     check_trace_options(options, rays)
-    shapes = {"means": (3,), "tangent_u": (3,), "tangent_v": (3,), "scales": (2,), "opacities": ()}
-    expected = {name: (surfels[name], (count, *shape)) for name, shape in shapes.items()}
-    expected |= {
+    expected = {
         "origins": (origins, (rays, 3)),
         "directions": (directions, (rays, 3)),
         "features": (features, (count, channels)),
@@ -72,12 +72,32 @@ def check_trace_shapes(
         "probe": (probe, (count, 3)),
     }
     for name, (tensor, shape) in expected.items():
-        if tensor is not None and tuple(tensor.shape) != shape:
-            raise ValueError(f"{name} must have shape {shape} to fit means and origins, got {tuple(tensor.shape)}")
+        if tensor is not None:
+            _check_shape(name, tensor, shape)
     if sh_rest is not None:
         counts = [rest_count(degree) for degree in range(MAX_DEGREE + 1)]
         if sh_rest.ndim != 3 or sh_rest.shape[1] not in counts or (sh_rest.shape[0], sh_rest.shape[2]) != (count, 3):
             raise ValueError(f"sh_rest must have shape ({count}, K, 3), K in {counts}, got {tuple(sh_rest.shape)}")
+
+
+def check_tree_shapes(surfels: dict[str, Tensor], alpha_cutoff: float) -> None:
+    """Raise ValueError when the geometry of N surfels, by name, or the cutoff that bounds it does not fit."""
+    count = _rows(surfels["means"])
+    shapes = {"means": (3,), "tangent_u": (3,), "tangent_v": (3,), "scales": (2,), "opacities": ()}
+    for name, shape in shapes.items():
+        _check_shape(name, surfels[name], (count, *shape))
+    if not 0 < alpha_cutoff < 0.99:
+        raise ValueError(f"alpha_cutoff={alpha_cutoff} must be in (0, 0.99): it bounds a surfel's support")
+
+
+def check_float32(tensors: dict[str, Tensor], twin: str) -> None:
+    """Raise ValueError, naming the tensor, when one is not float32 on the CPU; ``twin``: the module that takes any."""
+    for name, tensor in tensors.items():
+        if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
+            raise ValueError(
+                f"{name} must be float32 on the CPU, got {tensor.dtype} on {tensor.device}; convert it, or use {twin} "
+                "for float64"
+            )
 
 
 def check_trace_options(options: TraceOptions, rays: int) -> None:
@@ -85,8 +105,6 @@ def check_trace_options(options: TraceOptions, rays: int) -> None:
     rest_count(options.sh_degree)
     if not 0 <= options.transmittance_cutoff < 1:
         raise ValueError(f"transmittance_cutoff={options.transmittance_cutoff} must be in [0, 1); 0 never stops a ray")
-    if not 0 < options.alpha_cutoff < 0.99:
-        raise ValueError(f"alpha_cutoff={options.alpha_cutoff} must be in (0, 0.99): it bounds a surfel's support")
     for name, choices in {"direction_gradient": ("full", "last_sh"), "order": ("auto", "given", "sorted")}.items():
         if getattr(options, name) not in choices:
             raise ValueError(f"{name}={getattr(options, name)!r} is not one of {', '.join(choices)}")
@@ -94,6 +112,11 @@ def check_trace_options(options: TraceOptions, rays: int) -> None:
         value = getattr(options, name)
         if isinstance(value, Tensor) and tuple(value.shape) != (rays,):
             raise ValueError(f"{name} must be one number or have shape ({rays},), got {tuple(value.shape)}")
+
+
+def _check_shape(name: str, tensor: Tensor, shape: tuple[int, ...]) -> None:
+    if tuple(tensor.shape) != shape:
+        raise ValueError(f"{name} must have shape {shape} to fit means and origins, got {tuple(tensor.shape)}")
 
 
 def _rows(tensor: Tensor) -> int:
