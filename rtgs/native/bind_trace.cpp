@@ -3,6 +3,7 @@
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/unique_ptr.h>
 
+#include <algorithm>
 #include <optional>
 #include <stdexcept>
 
@@ -84,6 +85,56 @@ class Tracing {
     RTGS_CALL(isa_, trace_forward, args);
     if (out_weight_sum) RTGS_CALL(isa_, sum_packet_weights, args, out_weight_sum->data());
     hits_ = args.hits;
+    kept_ = keep;
+  }
+
+  // Sums over the rays into the memory, then the chain rule of the surfels into the given arrays.
+  void backward(Floats means, Floats tangent_u, Floats tangent_v, Floats scales, Floats opacities, MaybeFloats features,
+                MaybeFloats sh_dc, MaybeFloats sh_rest, Floats origins, Floats directions, MaybeFloats colors,
+                MaybeFloats features_traced, Floats alpha, MaybeFloats depth, MaybeFloats normal,
+                MaybeFloats grad_colors, MaybeFloats grad_features, MaybeFloats grad_alpha, MaybeFloats grad_depth,
+                MaybeFloats grad_normal, MaybeFloats out_means, MaybeFloats out_tangent_u, MaybeFloats out_tangent_v,
+                MaybeFloats out_scales, MaybeFloats out_opacities, MaybeFloats out_features, MaybeFloats out_sh_dc,
+                MaybeFloats out_sh_rest, MaybeFloats out_origins, MaybeFloats out_directions, MaybeFloats out_probe) {
+    nb::gil_scoped_release release;
+    if (!kept_) throw std::logic_error("trace: backward needs a forward pass with keep=True");
+    TraceMemory& m = *memory_;
+    int poisoned = 0;
+    TraceBackwardArgs args{};
+    args.surfels = trace_surfels(means, tangent_u, tangent_v, scales, opacities, features, sh_dc, sh_rest);
+    args.rays = trace_rays(origins, directions);
+    args.options = options_;
+    args.records = m.records.get();
+    args.tapes = m.tapes.get();
+    args.workspaces = m.workspaces.data();
+    args.colors = data_or_null(colors);
+    args.features = data_or_null(features_traced);
+    args.alpha = alpha.data();
+    args.depth = data_or_null(depth);
+    args.normal = data_or_null(normal);
+    args.grad_colors = data_or_null(grad_colors);
+    args.grad_features = data_or_null(grad_features);
+    args.grad_alpha = data_or_null(grad_alpha);
+    args.grad_depth = data_or_null(grad_depth);
+    args.grad_normal = data_or_null(grad_normal);
+    const TraceGradients out = {data_or_null(out_means),     data_or_null(out_tangent_u), data_or_null(out_tangent_v),
+                                data_or_null(out_scales),    data_or_null(out_opacities), data_or_null(out_features),
+                                data_or_null(out_sh_dc),     data_or_null(out_sh_rest),   data_or_null(out_probe)};
+    args.out_origins = data_or_null(out_origins);
+    args.out_directions = data_or_null(out_directions);
+    args.ray_gradients = out_origins || out_directions;
+    args.surfel_gradients = out.any();
+    args.poisoned = &poisoned;
+    const int64_t count = args.surfels.arrays.count;
+    args.row_stride = RTGS_CALL(isa_, trace_row_stride, args.surfels);
+    args.first_coefficient = RTGS_CALL(isa_, first_coefficient, args.surfels);
+    if (args.surfel_gradients) args.rows = m.rows.reserve(count * args.row_stride + 64);
+    args.touched = m.touched.reserve(count + 1);
+    std::fill_n(args.touched, count, uint8_t(0));
+    args.owners = m.owners.reserve(count + 1);
+    args.range_starts = m.ranges.reserve(options_.threads + 1);
+    RTGS_CALL(isa_, trace_backward, args);
+    if (args.surfel_gradients) RTGS_CALL(isa_, trace_surfel_gradients, args, m.slots.get(), out, !poisoned);
   }
 
   int64_t hits() const { return hits_; }
@@ -126,7 +177,7 @@ class Tracing {
   TraceOptionsNative options_;
   int sh_degree_;
   std::string order_;
-  bool sorted_ = false;
+  bool sorted_ = false, kept_ = false;
   TraceSurfels surfels_{};
   int64_t packets_ = 0, hits_ = 0;
   std::unique_ptr<TraceMemory> memory_;
@@ -161,6 +212,16 @@ void bind_trace(nb::module_& m) {
            nb::arg("t_max_each").none(), nb::arg("t_min"), nb::arg("t_max"), nb::arg("keep"),
            nb::arg("out_colors").none(), nb::arg("out_features").none(), nb::arg("out_alpha"),
            nb::arg("out_depth").none(), nb::arg("out_normal").none(), nb::arg("out_weight_sum").none())
+      .def("backward", &Tracing::backward, nb::arg("means"), nb::arg("tangent_u"), nb::arg("tangent_v"),
+           nb::arg("scales"), nb::arg("opacities"), nb::arg("features").none(), nb::arg("sh_dc").none(),
+           nb::arg("sh_rest").none(), nb::arg("origins"), nb::arg("directions"), nb::arg("colors").none(),
+           nb::arg("features_traced").none(), nb::arg("alpha"), nb::arg("depth").none(), nb::arg("normal").none(),
+           nb::arg("grad_colors").none(), nb::arg("grad_features").none(), nb::arg("grad_alpha").none(),
+           nb::arg("grad_depth").none(), nb::arg("grad_normal").none(), nb::arg("out_means").none(),
+           nb::arg("out_tangent_u").none(), nb::arg("out_tangent_v").none(), nb::arg("out_scales").none(),
+           nb::arg("out_opacities").none(), nb::arg("out_features").none(), nb::arg("out_sh_dc").none(),
+           nb::arg("out_sh_rest").none(), nb::arg("out_origins").none(), nb::arg("out_directions").none(),
+           nb::arg("out_probe").none())
       .def_prop_ro("hits", &Tracing::hits, "(ray, surfel) hits composited by forward")
       .def_prop_ro("order_used", &Tracing::order_used);
   m.def("release_trace_memory", [] { TraceMemoryPool::instance().clear(); },

@@ -13,7 +13,9 @@ set(RTGS_KERNELS
   raster_backward.cpp
   bvh_boxes.cpp
   trace_records.cpp
-  trace_forward.cpp)
+  trace_forward.cpp
+  trace_backward.cpp
+  trace_gradients.cpp)
 set(RTGS_BINDINGS
   module.cpp
   isa.cpp

@@ -22,7 +22,7 @@ enum TraceGradient : int {
   kTraceGradMean = 0, kTraceGradNormal = 3, kTraceGradU = 6, kTraceGradV = 9,
   kTraceGradLogAlpha = 12,
   kTraceGradProbe = 13,
-  kTraceGradChannels = 16,  // features and the three colours, padded; then the SH coefficients above degree 0
+  kTraceGradChannels = 16,  // features and the three colours, padded; then the coefficients of sh_rest in use
 };
 
 struct TraceSurfels {
@@ -90,35 +90,37 @@ struct TraceBackwardArgs {
   void** workspaces;
   const float *colors, *features, *alpha, *depth, *normal;                                // what forward wrote
   const float *grad_colors, *grad_features, *grad_alpha, *grad_depth, *grad_normal;       // upstream; null: none
-  float* rows;            // (N, row_stride) zero before the call
-  int row_stride;
-  bool surfel_gradients;  // rows are wanted
-  float *out_origins, *out_directions;  // null: not wanted
+  float* rows;            // (N, row_stride); valid where touched
+  uint8_t* touched;       // (N) zero before the call
+  int row_stride, first_coefficient;  // floats; where in a row the gradients of sh_rest begin
+  bool surfel_gradients, ray_gradients;  // what is wanted: rows; out_origins and out_directions
+  float *out_origins, *out_directions;
   int* poisoned;          // set to 1 when an upstream gradient is NaN or infinite
   // Several threads: thread k takes the packets from range_starts[k] on. A row belongs to the first range that meets its
   // surfel (owners); what later ranges have for it waits, in the order of packets, and is added at the end. So every row
   // is summed in the order of packets, whatever the number of threads.
   int64_t* range_starts;  // (threads + 1)
   int32_t* owners;        // (N)
-  int64_t* waiting_counts;      // (threads)
-  TapeArena* arenas;            // (threads)
 };
 
 struct TraceGradients {  // null: not wanted
   float *means, *tangent_u, *tangent_v, *scales, *opacities, *features, *sh_dc, *sh_rest, *probe;
+  bool any() const {
+    return means || tangent_u || tangent_v || scales || opacities || features || sh_dc || sh_rest || probe;
+  }
 };
 
 #define RTGS_TRACE_KERNELS(isa)                                                                                       \
   namespace isa {                                                                                                     \
   int packet_lanes();                                                                                                 \
   int trace_row_stride(const TraceSurfels&);                                                                          \
+  int first_coefficient(const TraceSurfels&);                                                                         \
   void trace_records(const SurfelArrays&, const TreeView&, float alpha_cutoff, float* records, int32_t* slots,        \
                      int threads);                                                                                    \
   void trace_forward(TraceForwardArgs&);                                                                              \
   void sum_packet_weights(const TraceForwardArgs&, float* weight_sum);                                                \
   void trace_backward(const TraceBackwardArgs&);                                                                      \
-  void trace_surfel_gradients(const TraceSurfels&, const int32_t* slots, float* rows, const TraceGradients&,          \
-                              float alpha_cutoff, bool saturate, int threads);                                        \
+  void trace_surfel_gradients(const TraceBackwardArgs&, const int32_t* slots, const TraceGradients&, bool saturate);  \
   void free_trace_workspace(void*);                                                                                   \
   }
 RTGS_TRACE_KERNELS(portable)

@@ -18,7 +18,7 @@ class PacketTracer {
  public:
   PacketTracer(const TraceForwardArgs& args, TraceWorkspace& work, int64_t packet)
       : args_(args), work_(work), rays_(args.rays, packet), slabs_(rays_), t_max_(rays_.t_max),
-        active_(rays_.exists) {}
+        active_(rays_.usable) {}
 
   void run();
   void write(PacketTape* tape, TapeArena* arena);

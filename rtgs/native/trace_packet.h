@@ -44,7 +44,7 @@ struct Growing {
 struct PacketRays {
   vfloat ox, oy, oz, dx, dy, dz, length, least_cosine, t_min, t_max;
   vint ray;
-  vmask exists;
+  vmask exists, usable;  // usable: exists, and is finite
   int count;
 
   PacketRays(const TraceRays& rays, int64_t packet) {
@@ -62,7 +62,8 @@ struct PacketRays {
     least_cosine = kGrazing * length;
     t_min = rays.t_min_each ? gather(rays.t_min_each, ray) : broadcast(rays.t_min);
     t_max = rays.t_max_each ? gather(rays.t_max_each, ray) : broadcast(rays.t_max);
-    t_max = select(exists, min(t_max, broadcast(kFarAway)), broadcast(-kFarAway));
+    usable = exists & finite(ox) & finite(oy) & finite(oz) & finite(dx) & finite(dy) & finite(dz);
+    t_max = select(usable, min(t_max, broadcast(kFarAway)), broadcast(-kFarAway));
   }
   Direction unit_direction() const {
     const vfloat inverse = where(gt(length, broadcast(0.f)), 1.f / max(length, broadcast(1e-37f)));
@@ -114,14 +115,17 @@ struct TraceWorkspace {
   // Composited: places by row; then the surfels met.
   Growing<int32_t> rows, keys, met_slots, met_places;
   Growing<uint64_t> long_keys, spare_keys;
-  Growing<float> met_weights;
-  Growing<float> rays;  // of the backward pass: per ray rows
+  // Of the backward pass.
+  Growing<uint64_t> clamped;    // by surfel met: colours at zero, a bit per ray, 16 bits apart per channel
+  Growing<float> waiting_rows;
+  Growing<int32_t> waiting_slots;
+  int64_t waiting;
 
   void release() {
     pending.release(), t.release(), exponents.release(), weights.release(), to_weight.release(), slots.release();
     columns.release(), sorted_places.release(), sorted_t.release(), rows.release(), keys.release();
-    met_slots.release(), met_places.release(), long_keys.release(), spare_keys.release(), met_weights.release();
-    rays.release();
+    met_slots.release(), met_places.release(), long_keys.release(), spare_keys.release();
+    clamped.release(), waiting_rows.release(), waiting_slots.release();
   }
 };
 

@@ -26,11 +26,12 @@ class ArenaBlocks {
 
 struct TraceMemory {
   Buffer<float> records;
-  Buffer<float> rows;  // one gradient row per slot; all zero between calls
+  Buffer<float> rows;  // one gradient row per slot
+  Buffer<uint8_t> touched;
   Buffer<int32_t> slots, order, owners;
   Buffer<PacketTape> tapes;
   Buffer<int64_t> ranges;
-  std::vector<ArenaBlocks> tape_blocks, waiting_blocks;  // one per thread
+  std::vector<ArenaBlocks> tape_blocks;  // one per thread
   std::vector<void*> workspaces;                         // likewise
 
   TraceMemory() = default;
@@ -40,7 +41,7 @@ struct TraceMemory {
   }
   void set_threads(int threads) {
     const size_t count = size_t(threads);
-    if (tape_blocks.size() < count) tape_blocks.resize(count), waiting_blocks.resize(count), workspaces.resize(count, nullptr);
+    if (tape_blocks.size() < count) tape_blocks.resize(count), workspaces.resize(count, nullptr);
   }
 };
 using TraceMemoryPool = MemoryPool<TraceMemory>;

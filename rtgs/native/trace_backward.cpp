@@ -1,0 +1,435 @@
+// Gradients of a packet from its tape (docs/tracer.md): responses surfel by surfel, the recursion along the rays row by
+// row, then all sums surfel by surfel, with rays as lanes and one transposed reduction per (surfel, packet). Surfels come
+// by ascending id, so that the sums of a ray do not depend on the tree.
+#include "trace_packet.h"
+
+namespace rtgs::RTGS_ISA {
+namespace {
+
+constexpr int kMostChannels = 48;      // features and colours, padded
+constexpr int kMostCoefficients = 48;  // of sh_rest, padded
+constexpr int padded(int floats) { return (floats + kLanes - 1) / kLanes * kLanes; }
+
+struct RowLayout {
+  int channels, coefficients, floats;  // the first two padded to whole registers
+  explicit RowLayout(const TraceSurfels& s)
+      : channels(padded(s.feature_count() + s.colour_count())),
+        coefficients(s.sh_dc ? padded(3 * rest_count(s.degree)) : 0),
+        floats(kTraceGradChannels + channels + coefficients) {}
+};
+
+// Upstream gradients of one ray, as the rows of the surfels it hit want them. Every hit adds weight times this.
+struct alignas(64) RayRow {
+  float channels[kMostChannels];          // features, colours
+  float coefficients[kMostCoefficients];  // colour c times basis k, at 3 k + c
+  float pattern[kMostCoefficients];       // colour c at 3 k + c
+};
+
+class PacketBackward {
+ public:
+  PacketBackward(const TraceBackwardArgs& args, TraceWorkspace& work, int64_t packet, int part)
+      : args_(args), work_(work), tape_(args.tapes[packet]), layout_(args.surfels), part_(part),
+        rays_(args.rays, packet) {
+    for (int k = 0; k < 3; ++k) to_origin_[k] = to_direction_[k] = broadcast(0.f);
+  }
+
+  void run() {
+    load_upstream();
+    if (args_.surfels.sh_dc) load_harmonics();
+    respond();
+    follow_rays();
+    add_surfels();
+    if (args_.ray_gradients) write_rays();
+  }
+
+ private:
+  void load_upstream();
+  vfloat upstream(const float* gradient, int stride, int component);
+  void add_rest(vfloat to_output, const float* output, int stride, int component);
+  void load_harmonics();
+
+  void respond();
+  vfloat value_gradient(const float* s, int64_t id, const PlaneHit& hit, uint64_t& clamped);
+  void follow_rays();
+  vint load_places(int row) const;
+
+  void add_surfels();
+  void prefetch(int k) const;
+  void geometry_sums(const float* s, const PlaneHit& hit, int32_t place, vmask met, vfloat w, vfloat* sums);
+  float* destination(int32_t slot, bool& adds);
+  void sum_hits(const RayRow* const* rows, uint32_t hits, const float* weights, float* out, bool adds) const;
+  void add_direction(const RayRow* const* rows, uint32_t hits, const float* weights, int64_t id);
+  void unclamp(uint64_t clamped, uint32_t hits, const RayRow** rows);
+  void write_rays();
+
+  const float* record(int32_t slot) const { return args_.records + int64_t(kTraceFields) * slot; }
+
+  const TraceBackwardArgs& args_;
+  TraceWorkspace& work_;
+  const PacketTape& tape_;
+  const RowLayout layout_;
+  const int part_;
+  const PacketRays rays_;
+
+  vfloat to_features_[32], to_colors_[3], to_normal_[3], to_depth_ = broadcast(0.f);
+  vfloat rest_ = broadcast(0.f);  // upstream times what the hits not yet passed add to the ray
+  vfloat basis_[16];
+  vint last_place_ = broadcast_int(-1);
+  vfloat to_origin_[3], to_direction_[3];
+  RayRow ray_rows_[kLanes], unclamped_[kLanes];
+  alignas(64) float to_basis_[kLanes][kMostCoefficients];  // of the ray: gradient to its basis, at 3 k + c
+};
+
+// ---- upstream --------------------------------------------------------------------------------------------------
+inline vfloat PacketBackward::upstream(const float* gradient, int stride, int component) {
+  if (!gradient) return broadcast(0.f);
+  const vfloat g = gather(gradient + component, rays_.ray * stride);
+  if (any(mask_not(finite(g)))) __atomic_store_n(args_.poisoned, 1, __ATOMIC_RELAXED);
+  return where(rays_.exists, g);
+}
+inline void PacketBackward::add_rest(vfloat to_output, const float* output, int stride, int component) {
+  if (output) rest_ += to_output * gather(output + component, rays_.ray * stride);
+}
+
+void PacketBackward::load_upstream() {
+  const int features = args_.surfels.feature_count();
+  for (int lane = 0; lane < kLanes; ++lane) memset(ray_rows_[lane].channels, 0, layout_.channels * sizeof(float));
+  for (int c = 0; c < features; ++c) {
+    to_features_[c] = upstream(args_.grad_features, features, c);
+    add_rest(to_features_[c], args_.features, features, c);
+    for (int lane = 0; lane < kLanes; ++lane) ray_rows_[lane].channels[c] = to_features_[c][lane];
+  }
+  for (int c = 0; c < 3; ++c) {
+    to_colors_[c] = upstream(args_.surfels.sh_dc ? args_.grad_colors : nullptr, 3, c);
+    add_rest(to_colors_[c], args_.colors, 3, c);
+    if (args_.surfels.sh_dc)
+      for (int lane = 0; lane < kLanes; ++lane) ray_rows_[lane].channels[features + c] = to_colors_[c][lane];
+    to_normal_[c] = upstream(args_.grad_normal, 3, c);
+    add_rest(to_normal_[c], args_.normal, 3, c);
+  }
+  to_depth_ = upstream(args_.grad_depth, 1, 0);
+  add_rest(to_depth_, args_.depth, 1, 0);
+  rest_ -= upstream(args_.grad_alpha, 1, 0) * (1.f - gather(args_.alpha, rays_.ray));
+}
+
+void PacketBackward::load_harmonics() {
+  packet_basis(args_.surfels.degree, rays_.unit_direction(), basis_);
+  const int rest = rest_count(args_.surfels.degree);
+  for (int lane = 0; lane < kLanes; ++lane) {
+    RayRow& row = ray_rows_[lane];
+    memset(row.coefficients, 0, layout_.coefficients * sizeof(float));
+    memset(row.pattern, 0, layout_.coefficients * sizeof(float));
+    memset(to_basis_[lane], 0, layout_.coefficients * sizeof(float));
+    for (int k = 0; k < rest; ++k)
+      for (int c = 0; c < 3; ++c) {
+        row.pattern[3 * k + c] = to_colors_[c][lane];
+        row.coefficients[3 * k + c] = to_colors_[c][lane] * basis_[k][lane];
+      }
+  }
+}
+
+// ---- along the rays ----------------------------------------------------------------------------------------------
+// Gradient of the loss by the weight of a hit, alpha's part left out.
+inline vfloat PacketBackward::value_gradient(const float* s, int64_t id, const PlaneHit& hit, uint64_t& clamped) {
+  vfloat to_weight = hit.t * to_depth_;
+  const int features = args_.grad_features ? args_.surfels.feature_count() : 0;
+  const float* values = args_.surfels.arrays.features + int64_t(args_.surfels.feature_count()) * id;
+  for (int c = 0; c < features; ++c) to_weight = fma(to_features_[c], broadcast(values[c]), to_weight);
+  if (args_.grad_normal) {
+    const float* n = s + kTraceNormal;
+    const vfloat along = to_normal_[0] * n[0] + to_normal_[1] * n[1] + to_normal_[2] * n[2];
+    to_weight += negated_where(gt(hit.cosine, broadcast(0.f)), along);
+  }
+  clamped = 0;
+  if (args_.surfels.sh_dc) {
+    vfloat raw[3];
+    surfel_colors(args_.surfels, id, rest_count(args_.surfels.degree), basis_, raw);
+    for (int c = 0; c < 3; ++c) {
+      clamped |= uint64_t(mask_bits(le(raw[c], broadcast(0.f)))) << (16 * c);
+      to_weight = fma(to_colors_[c], max(raw[c], broadcast(0.f)), to_weight);
+    }
+  }
+  return to_weight;
+}
+
+void PacketBackward::respond() {
+  const int64_t floats = int64_t(tape_.places_used) * kLanes;
+  work_.exponents.reserve(floats);
+  work_.to_weight.reserve(floats);
+  work_.weights.reserve(floats);
+  work_.clamped.reserve(tape_.surfels);
+  for (int k = 0; k < tape_.surfels; ++k) {
+    if (k + kTracePrefetch < tape_.surfels) prefetch(k + kTracePrefetch);
+    const float* s = record(tape_.slots[k]);
+    const int64_t at = int64_t(tape_.places[k]) * kLanes;
+    const PlaneHit hit = plane_hit(s, rays_);
+    store(work_.exponents.data + at, response_exponent(s, hit.rho));
+    store(work_.to_weight.data + at, value_gradient(s, record_id(s), hit, work_.clamped[k]));
+    store(work_.weights.data + at, broadcast(0.f));
+  }
+}
+
+inline vint PacketBackward::load_places(int row) const {
+  if (tape_.wide) return load_int(static_cast<const int32_t*>(tape_.rows) + int64_t(row) * kLanes);
+  const vint places = load_short(static_cast<const uint16_t*>(tape_.rows) + int64_t(row) * kLanes);
+  return select_int(eq_int(places, broadcast_int(0xffff)), broadcast_int(-1), places);
+}
+
+// Front to back. Leaves the weights of the hits in `weights` and dL/d ln(alpha) in `exponents`.
+void PacketBackward::follow_rays() {
+  const vint lane = truncate(lane_numbers());
+  vfloat transmittance = broadcast(1.f), rest = rest_;
+  for (int row = 0; row < tape_.row_count; ++row) {
+    const vint place = load_places(row);
+    const vmask hit = gt_int(place, broadcast_int(-1));
+    const vint at = max_int(place, broadcast_int(0)) * kLanes + lane;
+    const vfloat raw = exp2_response(gather(work_.exponents.data, at)), alpha = min(raw, broadcast(kMaxAlpha));
+    const vfloat to_weight = where(hit, gather(work_.to_weight.data, at));
+    const vfloat w = where(hit, alpha * transmittance);
+    rest -= w * to_weight;
+    const vfloat log_alpha = where(lt(raw, broadcast(kMaxAlpha)),
+                                   (transmittance * to_weight - rest * reciprocal(1.f - alpha)) * alpha);
+    transmittance -= w;
+    scatter(work_.exponents.data, at, log_alpha, hit);
+    scatter(work_.weights.data, at, w, hit);
+    last_place_ = select_int(hit, place, last_place_);
+  }
+}
+
+// ---- the sums of the surfels -------------------------------------------------------------------------------------
+inline void PacketBackward::prefetch(int k) const {
+  __builtin_prefetch(record(tape_.slots[k]));
+}
+
+inline void PacketBackward::geometry_sums(const float* s, const PlaneHit& hit, int32_t place, vmask met, vfloat w,
+                                          vfloat* sums) {
+  const float *n = s + kTraceNormal, *a = s + kTraceU, *b = s + kTraceV;
+  const vfloat log_alpha = where(met, load(work_.exponents.data + int64_t(place) * kLanes));
+  const vfloat t = where(met, hit.t), ex = where(met, hit.ex), ey = where(met, hit.ey), ez = where(met, hit.ez);
+  const vfloat to_u = where(met, -log_alpha * hit.u), to_v = where(met, -log_alpha * hit.v);
+  const vfloat speed_u = rays_.dx * a[0] + rays_.dy * a[1] + rays_.dz * a[2];
+  const vfloat speed_v = rays_.dx * b[0] + rays_.dy * b[1] + rays_.dz * b[2];
+  const vfloat to_t = to_u * speed_u + to_v * speed_v + w * to_depth_;
+  const vfloat z = where(met, to_t * hit.inverse);
+  vfloat to_hit[3];  // by the ray's origin; the surfel's mean moves the other way
+  for (int k = 0; k < 3; ++k) {
+    to_hit[k] = to_u * a[k] + to_v * b[k] - z * n[k];
+    const vfloat later = t * to_hit[k];
+    to_origin_[k] += to_hit[k];
+    to_direction_[k] += later;
+    sums[kTraceGradMean + k] = -to_hit[k];
+    sums[kTraceGradProbe + k] = later * -0.5f;
+  }
+  const vfloat e[3] = {ex, ey, ez};
+  for (int k = 0; k < 3; ++k) {
+    sums[kTraceGradNormal + k] = -z * e[k];
+    sums[kTraceGradU + k] = to_u * e[k];
+    sums[kTraceGradV + k] = to_v * e[k];
+  }
+  if (args_.grad_normal) {
+    const vfloat facing = negated_where(gt(hit.cosine, broadcast(0.f)), w);
+    for (int k = 0; k < 3; ++k) sums[kTraceGradNormal + k] += facing * to_normal_[k];
+  }
+  sums[kTraceGradLogAlpha] = log_alpha;
+}
+
+// Where the sums of this packet go: the surfel's row, or the end of the waiting rows.
+inline float* PacketBackward::destination(int32_t slot, bool& adds) {
+  if (args_.options.threads > 1 && args_.owners[slot] != part_) {
+    const int64_t waiting = work_.waiting++;
+    work_.waiting_slots.reserve(waiting + 1);
+    work_.waiting_rows.reserve((waiting + 1) * args_.row_stride);
+    work_.waiting_slots[waiting] = slot;
+    adds = false;
+    return work_.waiting_rows.data + waiting * args_.row_stride;
+  }
+  adds = args_.touched[slot];
+  args_.touched[slot] = 1;
+  return args_.rows + int64_t(slot) * args_.row_stride;
+}
+
+inline void put(float* out, vfloat v, bool adds) { store(out, adds ? load(out) + v : v); }
+
+// Sums of weight times ray row over the hits of one surfel.
+inline void PacketBackward::sum_hits(const RayRow* const* rows, uint32_t hits, const float* weights, float* out,
+                                     bool adds) const {
+  for (int c = 0; c < layout_.channels; c += kLanes) {
+    vfloat sum = broadcast(0.f);
+    for (uint32_t left = hits; left; left &= left - 1) {
+      const int lane = __builtin_ctz(left);
+      sum = fma(broadcast(weights[lane]), load(rows[lane]->channels + c), sum);
+    }
+    put(out + kTraceGradChannels + c, sum, adds);
+  }
+  for (int c = 0; c < layout_.coefficients; c += kLanes) {
+    vfloat sum = broadcast(0.f);
+    for (uint32_t left = hits; left; left &= left - 1) {
+      const int lane = __builtin_ctz(left);
+      sum = fma(broadcast(weights[lane]), load(rows[lane]->coefficients + c), sum);
+    }
+    put(out + kTraceGradChannels + layout_.channels + c, sum, adds);
+  }
+}
+
+inline void PacketBackward::add_direction(const RayRow* const* rows, uint32_t hits, const float* weights, int64_t id) {
+  const float* values = args_.surfels.sh_rest + int64_t(3) * args_.surfels.rest * id;
+  const int used = 3 * rest_count(args_.surfels.degree);
+  for (int c = 0; c < layout_.coefficients; c += kLanes) {
+    const vfloat value = load_first(values + c, used - c < kLanes ? used - c : kLanes);
+    for (uint32_t left = hits; left; left &= left - 1) {
+      const int lane = __builtin_ctz(left);
+      float* sum = to_basis_[lane] + c;
+      store(sum, fma(weights[lane] * load(rows[lane]->pattern + c), value, load(sum)));
+    }
+  }
+}
+
+// Rays whose colour at this surfel is clamped at zero get a row without that colour.
+void PacketBackward::unclamp(uint64_t clamped, uint32_t hits, const RayRow** rows) {
+  const int features = args_.surfels.feature_count(), used = 3 * rest_count(args_.surfels.degree);
+  for (; hits; hits &= hits - 1) {
+    const int lane = __builtin_ctz(hits);
+    if (!(clamped >> lane & 0x000100010001ull)) continue;
+    RayRow& row = unclamped_[lane];
+    row = ray_rows_[lane];
+    rows[lane] = &row;
+    for (int c = 0; c < 3; ++c) {
+      if (!(clamped >> (16 * c + lane) & 1)) continue;
+      row.channels[features + c] = 0.f;
+      for (int k = c; k < used; k += 3) row.coefficients[k] = row.pattern[k] = 0.f;
+    }
+  }
+}
+
+void PacketBackward::add_surfels() {
+  const RayRow* all_rows[kLanes];
+  for (int lane = 0; lane < kLanes; ++lane) all_rows[lane] = &ray_rows_[lane];
+  for (int k = 0; k < tape_.surfels; ++k) {
+    if (args_.surfel_gradients && k + kTracePrefetch < tape_.surfels) {
+      const float* row = args_.rows + int64_t(tape_.slots[k + kTracePrefetch]) * args_.row_stride;
+      for (int c = 0; c < layout_.floats; c += 16) __builtin_prefetch(row + c, 1);
+    }
+    const int32_t slot = tape_.slots[k], place = tape_.places[k];
+    const float* s = record(slot);
+    const PlaneHit hit = plane_hit(s, rays_);
+    const vfloat w = load(work_.weights.data + int64_t(place) * kLanes);
+    const vmask met = gt(w, broadcast(0.f));
+    vfloat sums[kTraceGradChannels];
+    geometry_sums(s, hit, place, met, w, sums);
+
+    const uint32_t hits = mask_bits(met);
+    alignas(64) float weights[kLanes];
+    store(weights, w);
+    const RayRow* rows[kLanes];
+    memcpy(rows, all_rows, sizeof rows);
+    if (work_.clamped[k]) unclamp(work_.clamped[k], hits, rows);
+    if (args_.surfel_gradients) {
+      bool adds;
+      float* out = destination(slot, adds);
+      for (int c = 0; c < kTraceGradChannels; c += kLanes) put(out + c, settled(sums_of<>(sums + c)), adds);
+      sum_hits(rows, hits, weights, out, adds);
+    }
+    if (args_.ray_gradients && layout_.coefficients) {
+      const uint32_t wanted =
+          args_.options.last_sh ? hits & mask_bits(eq_int(last_place_, broadcast_int(place))) : hits;
+      add_direction(rows, wanted, weights, record_id(s));
+    }
+  }
+}
+
+void PacketBackward::write_rays() {
+  if (args_.options.last_sh)
+    for (vfloat& v : to_direction_) v = broadcast(0.f);
+  if (layout_.coefficients) {
+    const Direction d = rays_.unit_direction();
+    vfloat to_basis[kMostCoefficients];
+    for (vfloat& v : to_basis) v = broadcast(0.f);
+    for (int k = 0; k < rest_count(args_.surfels.degree); ++k)
+      for (int lane = 0; lane < kLanes; ++lane) {
+        const float* sums = to_basis_[lane] + 3 * k;
+        to_basis[3 * k][lane] = sums[0] + sums[1] + sums[2];
+      }
+    Direction g = args_.surfels.degree == 1   ? sh_derivative<1>(d, to_basis)
+                  : args_.surfels.degree == 2 ? sh_derivative<2>(d, to_basis)
+                                              : sh_derivative<3>(d, to_basis);
+    const vfloat along = g.x * d.x + g.y * d.y + g.z * d.z;
+    const vfloat inverse = where(gt(rays_.length, broadcast(0.f)), 1.f / max(rays_.length, broadcast(1e-37f)));
+    to_direction_[0] += (g.x - along * d.x) * inverse;
+    to_direction_[1] += (g.y - along * d.y) * inverse;
+    to_direction_[2] += (g.z - along * d.z) * inverse;
+  }
+  for (int k = 0; k < 3; ++k) {
+    if (args_.out_origins) scatter(args_.out_origins + k, rays_.ray * 3, to_origin_[k], rays_.exists);
+    if (args_.out_directions) scatter(args_.out_directions + k, rays_.ray * 3, to_direction_[k], rays_.exists);
+  }
+}
+
+// ---- threads -----------------------------------------------------------------------------------------------------
+// Ranges of about equal work: range_starts. And to which range each surfel's row belongs.
+void split_work(const TraceBackwardArgs& args) {
+  const int64_t packets = packet_count(args.rays);
+  const int threads = args.options.threads;
+  int64_t total = 0, done = 0;
+  const auto work = [&](int64_t p) { return int64_t(args.tapes[p].hits) + 8 * args.tapes[p].surfels; };
+  for (int64_t packet = 0; packet < packets; ++packet) total += work(packet);
+  int range = 0;
+  for (int64_t packet = 0; packet < packets; ++packet) {
+    while (range < threads && done * threads >= total * range) args.range_starts[range++] = packet;
+    done += work(packet);
+  }
+  while (range <= threads) args.range_starts[range++] = packets;
+  if (threads == 1 || !args.surfel_gradients) return;
+  memset(args.owners, 0x7f, size_t(args.surfels.arrays.count) * sizeof(int32_t));
+#pragma omp parallel for num_threads(threads) schedule(static, 1)
+  for (int part = 0; part < threads; ++part)
+    for (int64_t packet = args.range_starts[part]; packet < args.range_starts[part + 1]; ++packet)
+      for (int32_t k = 0; k < args.tapes[packet].surfels; ++k) {
+        int32_t* owner = args.owners + args.tapes[packet].slots[k];
+        int32_t before = __atomic_load_n(owner, __ATOMIC_RELAXED);
+        while (part < before &&
+               !__atomic_compare_exchange_n(owner, &before, part, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {
+        }
+      }
+}
+
+// Each thread takes a share of the slots, so that the order of additions to a row is that of the packets.
+void add_waiting(const TraceBackwardArgs& args) {
+  const int threads = args.options.threads;
+  const int64_t count = args.surfels.arrays.count;
+  const int floats = RowLayout(args.surfels).floats;
+#pragma omp parallel for num_threads(threads) schedule(static, 1)
+  for (int part = 0; part < threads; ++part) {
+    const int64_t begin = count * part / threads, end = count * (part + 1) / threads;
+    for (int range = 1; range < threads; ++range) {
+      TraceWorkspace& from = workspace_of(args.workspaces, range);
+      for (int64_t k = 0; k < from.waiting; ++k) {
+        const int64_t slot = from.waiting_slots[k];
+        if (slot < begin || slot >= end) continue;
+        const float* waiting = from.waiting_rows.data + args.row_stride * k;
+        float* row = args.rows + args.row_stride * slot;
+        for (int c = 0; c < floats; c += kLanes) store(row + c, load(row + c) + load(waiting + c));
+      }
+    }
+  }
+}
+
+}  // namespace
+
+int trace_row_stride(const TraceSurfels& surfels) { return (RowLayout(surfels).floats + 15) / 16 * 16; }
+
+int first_coefficient(const TraceSurfels& surfels) { return kTraceGradChannels + RowLayout(surfels).channels; }
+
+void trace_backward(const TraceBackwardArgs& args) {
+  const int threads = args.options.threads;
+  split_work(args);
+  for (int part = 0; part < threads; ++part) workspace_of(args.workspaces, part).waiting = 0;
+#pragma omp parallel for num_threads(threads) schedule(static, 1) if (threads > 1)
+  for (int part = 0; part < threads; ++part) {
+    TraceWorkspace& work = workspace_of(args.workspaces, part);
+    for (int64_t packet = args.range_starts[part]; packet < args.range_starts[part + 1]; ++packet)
+      PacketBackward(args, work, packet, part).run();
+  }
+  if (threads > 1 && args.surfel_gradients) add_waiting(args);
+}
+
+}  // namespace rtgs::RTGS_ISA
