@@ -28,8 +28,7 @@ def _mesh(mi: Any, shape: Shape, mesh: Mesh, seed: int) -> Any:
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict(_bsdf(mi, shape.material, seed))
     if shape.emission is not None:
-        radiance = {"type": "rgb", "value": list(shape.emission)}
-        properties["emitter"] = mi.load_dict({"type": "area", "radiance": radiance})
+        properties["emitter"] = mi.load_dict({"type": "area", "radiance": _radiance(mi, shape, seed)})
     smooth = shape.kind not in _FLAT_KINDS
     built = mi.Mesh(
         shape.name,
@@ -49,11 +48,24 @@ def _mesh(mi: Any, shape: Shape, mesh: Mesh, seed: int) -> Any:
     return built
 
 
+def _radiance(mi: Any, shape: Shape, seed: int) -> dict[str, Any]:
+    """What a lamp sends out: one colour, or that colour times the picture ``glow``."""
+    emission = np.asarray(shape.emission, float)
+    if shape.glow == "plain":
+        return {"type": "rgb", "value": emission.tolist()}
+    picture = texture(shape.material, seed, name=shape.glow) * emission
+    return {"type": "bitmap", "bitmap": mi.Bitmap(picture.astype(np.float32)), "raw": True}
+
+
 def _bsdf(mi: Any, material: Material, seed: int) -> dict[str, Any]:
     if material.kind == "thin_glass":
         return {"type": "thindielectric", "int_ior": material.ior, "ext_ior": 1.0}
+    if material.kind == "glass":
+        return {"type": "dielectric", "int_ior": material.ior, "ext_ior": 1.0}
     if material.kind == "mirror":
-        return {"type": "roughconductor", "alpha": max(material.roughness, 1e-3), "material": "Ag"}
+        silver = {"material": "Ag", "specular_reflectance": {"type": "rgb", "value": list(material.color)}}
+        rough = {"type": "roughconductor", "alpha": material.roughness}
+        return {"type": "twosided", "nested": silver | (rough if material.roughness >= 1e-3 else {"type": "conductor"})}
     picture = {
         "type": "bitmap",
         "bitmap": mi.Bitmap(texture(material, seed).astype(np.float32)),

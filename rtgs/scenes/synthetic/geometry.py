@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtgs.scenes.synthetic.description import Shape
+from rtgs.scenes.synthetic.sculpt import sculpt
 
 Array = NDArray[np.float64]
 
@@ -52,11 +53,12 @@ def _smooth_profile(profile: tuple[tuple[float, float], ...], samples: int) -> A
     return PchipInterpolator(lengths, knots, axis=0)(np.linspace(0, lengths[-1], samples))
 
 
-def lathe(profile: tuple[tuple[float, float], ...], columns: int = 128, samples: int = 96) -> Mesh:
-    """Surface of revolution about z of (radius, height) pairs: cups, bottles, jars. Open where the profile is."""
+def lathe(profile: tuple[tuple[float, float], ...], arc: float = 360.0, columns: int = 128, samples: int = 96) -> Mesh:
+    """Surface of revolution about z of (radius, height) pairs: cups, bottles, jars. Open where the profile is, and
+    beyond ``arc`` degrees."""
     curve = _smooth_profile(profile, samples)
     slope = np.gradient(curve, axis=0)
-    angle = np.linspace(0, 2 * np.pi, columns)
+    angle = np.linspace(0, np.radians(arc), columns)
     radius, height = curve[:, :1], curve[:, 1:]
     points = np.stack((radius * np.cos(angle), radius * np.sin(angle), height + 0 * angle), -1)
     normals = np.stack((slope[:, 1:] * np.cos(angle), slope[:, 1:] * np.sin(angle), -slope[:, :1] + 0 * angle), -1)
@@ -111,6 +113,52 @@ def box(half: tuple[float, float, float], inward: bool = False) -> Mesh:
     return merge(sides)
 
 
+def dome(radius: float, rows: int = 48, columns: int = 128) -> Mesh:
+    """Upper half sphere seen from inside: a sky. UV = (azimuth, elevation)."""
+    elevation = np.linspace(0, np.pi / 2, rows)[:, None]
+    angle = np.linspace(0, 2 * np.pi, columns)
+    unit = np.stack(
+        (np.cos(elevation) * np.cos(angle), np.cos(elevation) * np.sin(angle), np.sin(elevation) + 0 * angle), -1
+    )
+    return _grid_mesh(radius * unit, -unit, flip=True)
+
+
+def kernels(shape: Shape, lumps: int = 6, rows: int = 9, columns: int = 14) -> Mesh:
+    """A heap of irregular kernels inside the profile: each some overlapping small balls."""
+    rng = np.random.default_rng(shape.count)
+    profile = np.asarray(shape.profile, float)
+    ball = sphere(1.0, rows, columns)
+    heights = np.linspace(profile[0, 1], profile[-1, 1], 64)
+    radii = np.interp(heights, profile[:, 1], profile[:, 0])
+    volume = np.cumsum(radii**2) / np.sum(radii**2)
+    meshes = []
+    for number in range(shape.count):
+        height = np.interp((number + rng.random()) / shape.count, volume, heights)
+        reach = np.interp(height, heights, radii)
+        angle, distance = 2.39996 * number + rng.normal(0, 0.3), reach * rng.random() ** 0.3
+        center = np.array((distance * np.cos(angle), distance * np.sin(angle), height))
+        for _ in range(lumps):
+            offset = rng.normal(0, 1, 3)
+            offset *= rng.uniform(0.35, 0.75) * shape.size[0] / np.linalg.norm(offset)
+            vertices = ball.vertices * shape.size[0] * rng.uniform(0.3, 0.6) + center + offset
+            meshes.append(Mesh(vertices, ball.normals, ball.uvs * 0.2 + rng.random(2), ball.faces))
+    return merge(meshes)
+
+
+def box_mapped(vertices: Array, normals: Array, faces: NDArray[np.int32]) -> Mesh:
+    """A mesh with UVs in metres, each face seen along the axis it faces most; seams double their vertices."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    axis = np.abs(np.cross(b - a, c - a)).argmax(1)
+    meshes = []
+    for k in range(3):
+        used, renumbered = np.unique(faces[axis == k], return_inverse=True)
+        uv = vertices[used][:, [(k + 1) % 3, (k + 2) % 3]]
+        if k == 1:
+            uv = uv[:, ::-1]  # x across, z up, as on the other upright side
+        meshes.append(Mesh(vertices[used], normals[used], uv, renumbered.reshape(-1, 3).astype(np.int32)))
+    return merge([mesh for mesh in meshes if len(mesh.faces)])
+
+
 def merge(meshes: list[Mesh]) -> Mesh:
     offsets = np.cumsum([0] + [len(m.vertices) for m in meshes[:-1]])
     return Mesh(
@@ -132,7 +180,7 @@ def build(shape: Shape) -> Mesh:
     """The mesh of a described shape, in the world."""
     match shape.kind:
         case "lathe":
-            mesh = lathe(shape.profile)
+            mesh = lathe(shape.profile, shape.arc)
         case "box":
             mesh = box(shape.size, shape.inward)
         case "sphere":
@@ -141,12 +189,18 @@ def build(shape: Shape) -> Mesh:
             mesh = knot(shape.size[0])
         case "plane":
             mesh = plane(shape.size)
+        case "dome":
+            mesh = dome(shape.size[0])
+        case "sculpt":
+            mesh = box_mapped(*sculpt(shape))
+        case "kernels":
+            mesh = kernels(shape)
         case other:
             raise ValueError(f"shape {shape.name!r}: unknown kind {other!r}")
     rotation = _rotation(shape.tilt, shape.turn)
-    return Mesh(
-        mesh.vertices @ rotation.T + np.asarray(shape.position), mesh.normals @ rotation.T, mesh.uvs, mesh.faces
-    )
+    vertices, normals = mesh.vertices @ rotation.T, mesh.normals @ rotation.T
+    places = (shape.position, *shape.copies)
+    return merge([Mesh(vertices + np.asarray(place), normals, mesh.uvs, mesh.faces) for place in places])
 
 
 def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> tuple[Array, Array]:

@@ -19,7 +19,7 @@ def look_at(position: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def cameras(viewpoints: Viewpoints, width: int, height: int, seed: int = 0) -> list[Camera]:
-    """Jittered cameras on ``rings`` of increasing elevation; neighbours in name order are neighbours in space."""
+    """Jittered cameras on ``rings`` (or arcs of them) of increasing elevation; name order is order in space."""
     rng = np.random.default_rng(seed)
     target = np.asarray(viewpoints.target, float)
     focal = float(0.5 * width / np.tan(np.radians(viewpoints.field_of_view) / 2))
@@ -28,7 +28,8 @@ def cameras(viewpoints: Viewpoints, width: int, height: int, seed: int = 0) -> l
         turn, ring = divmod(index * viewpoints.rings, viewpoints.count)
         share = (ring / viewpoints.count) if viewpoints.rings > 1 else index / viewpoints.count
         elevation = np.radians(np.interp(turn, (0, max(viewpoints.rings - 1, 1)), viewpoints.elevation))
-        azimuth = 2 * np.pi * (share + turn / (2 * viewpoints.rings)) + rng.normal(0, 0.03)
+        azimuth = np.radians(viewpoints.start) + rng.normal(0, 0.03)
+        azimuth += np.radians(viewpoints.arc) * (share + turn / (2 * viewpoints.rings) * (viewpoints.arc >= 360))
         radius = rng.uniform(*viewpoints.radius)
         offset = np.array((np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)))
         jitter = viewpoints.jitter * viewpoints.radius[0] * rng.normal(0, 0.5, 3)
