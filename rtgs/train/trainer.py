@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import math
 import platform
-import resource
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -30,6 +29,7 @@ from rtgs.train.checkpoint import (
     save_checkpoint,
 )
 from rtgs.train.guard import check_loss, diverged
+from rtgs.train.memory import peak_memory_mb, start_peak_memory
 from rtgs.train.progress import Progress, SilentProgress, StepReport
 from rtgs.train.schedule import OrderState, ViewOrder
 from rtgs.train.seeds import seed_for
@@ -52,7 +52,7 @@ class TrainSummary:
     steps: int  # done in all, resumed ones included
     seconds: float  # training time in all, resumed ones included
     seconds_per_step: float  # of this process
-    peak_memory_mb: float  # largest resident set of this process
+    peak_memory_mb: float  # largest resident set during this training (elsewhere than on Linux: of the process)
     surfels: int  # in all sets
     loss: float  # running average at the end
     psnr_train: float  # running average at the end, dB
@@ -117,6 +117,7 @@ class Trainer:
             TrainingDiverged: a loss or gradient is not finite; the last checkpoint is intact.
             CheckpointError: ``checkpoint_dir`` holds checkpoints that cannot be used.
         """
+        start_peak_memory()
         resumed_from = self._resume()
         first = self._step
         self._began = time.monotonic()
@@ -134,7 +135,7 @@ class Trainer:
             steps=self._step,
             seconds=self._elapsed_before + seconds,
             seconds_per_step=seconds / max(self._step - first, 1),
-            peak_memory_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+            peak_memory_mb=peak_memory_mb(),
             surfels=self._surfels(),
             loss=self._averages.loss if self._averages.loss is not None else math.nan,
             psnr_train=self._averages.psnr if self._averages.psnr is not None else math.nan,

@@ -1,0 +1,163 @@
+"""Tables as papers print them: methods by scenes, the best three marked, spread over seeds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from rtgs.evaluate.evaluate import EvaluationTable
+from rtgs.evaluate.tables import PAPER_SCORES, PaperScore
+
+STAND_IN, PAPER_DATA, OWN_DATA = "stand_in", "paper", "own"
+DATA_KINDS = (STAND_IN, PAPER_DATA, OWN_DATA)
+
+
+@dataclass(frozen=True)
+class TableSpec:
+    """Which table this is, and on whose data."""
+
+    name: str  # also the folder it is written into
+    title: str
+    data: str = OWN_DATA  # one of DATA_KINDS
+
+    def __post_init__(self) -> None:
+        if self.data not in DATA_KINDS:
+            raise ValueError(f"table.data={self.data!r} is unknown: choose one of {', '.join(DATA_KINDS)}")
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One evaluated run of a table. ``paper_scene``: the paper's name for the scene, where it has one."""
+
+    evaluation: EvaluationTable
+    seed: int
+    paper_scene: str = ""
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A column: key of the evaluation or of the run's facts."""
+
+    key: str
+    title: str
+    digits: int
+    higher_is_better: bool | None  # None: not ranked
+
+
+QUALITY = (
+    Metric("psnr", "PSNR", 2, True),
+    Metric("ssim", "SSIM", 3, True),
+    Metric("lpips_01", "LPIPS", 3, False),
+)
+COSTS = (
+    Metric("psnr_masked", "PSNR in the mask", 2, True),
+    Metric("train_seconds", "training s", 0, None),
+    Metric("peak_memory_mb", "memory MB", 0, None),
+    Metric("surfels", "Gaussians", 0, None),
+)
+
+
+@dataclass(frozen=True)
+class Value:
+    """Mean over seeds and, with more than one, the sample standard deviation."""
+
+    mean: float
+    spread: float | None
+    seeds: int
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One method on one scene."""
+
+    method: str
+    scene: str
+    values: Mapping[str, Value | None]  # by metric key
+    ranks: Mapping[str, int]  # 1, 2, 3 by metric key, where earned
+    paper: PaperScore | None
+    seeds: tuple[int, ...]
+    preset: str
+    resolution: str
+    views: int
+
+
+@dataclass(frozen=True)
+class PaperTable:
+    """All cells, methods and scenes in the order of the runs."""
+
+    spec: TableSpec
+    methods: tuple[str, ...]
+    scenes: tuple[str, ...]
+    cells: Mapping[tuple[str, str], Cell]
+
+    def cell(self, method: str, scene: str) -> Cell | None:
+        """The cell, or None where this method was not run on this scene (or failed)."""
+        return self.cells.get((method, scene))
+
+
+def build_table(spec: TableSpec, runs: Sequence[Measured]) -> PaperTable:
+    """Group runs by method and scene.
+
+    Raises:
+        ValueError: no runs, or the same method, scene and seed twice.
+    """
+    if not runs:
+        raise ValueError(f"table {spec.name} has no runs")
+    groups: dict[tuple[str, str], list[Measured]] = {}
+    for run in runs:
+        facts = run.evaluation.facts
+        group = groups.setdefault((facts.method, facts.scene), [])
+        if any(other.seed == run.seed for other in group):
+            raise ValueError(f"table {spec.name}: {facts.method} on {facts.scene} with seed {run.seed} comes twice")
+        group.append(run)
+    values = {key: {m.key: _value(m.key, group) for m in (*QUALITY, *COSTS)} for key, group in groups.items()}
+    ranks = _ranks(values)
+    cells = {key: _cell(key, group, values[key], ranks[key], spec) for key, group in groups.items()}
+    methods = tuple(dict.fromkeys(method for method, _ in groups))
+    return PaperTable(spec, methods, tuple(dict.fromkeys(scene for _, scene in groups)), cells)
+
+
+def _value(key: str, group: Sequence[Measured]) -> Value | None:
+    found = [value for run in group if (value := _of_run(key, run.evaluation)) is not None]
+    if not found:
+        return None
+    mean = math.fsum(found) / len(found)
+    spread = math.sqrt(math.fsum((v - mean) ** 2 for v in found) / (len(found) - 1)) if len(found) > 1 else None
+    return Value(mean, spread, len(found))
+
+
+def _of_run(key: str, evaluation: EvaluationTable) -> float | None:
+    if key in ("train_seconds", "peak_memory_mb", "surfels"):
+        return getattr(evaluation.facts, key)
+    return evaluation.mean(key)
+
+
+def _ranks(values: Mapping[tuple[str, str], Mapping[str, Value | None]]) -> dict[tuple[str, str], dict[str, int]]:
+    """Places 1 to 3 within each scene; equal printed figures share a place; a method alone earns none."""
+    ranks: dict[tuple[str, str], dict[str, int]] = {key: {} for key in values}
+    for scene in {scene for _, scene in values}:
+        mine = [key for key in values if key[1] == scene]
+        for metric in (*QUALITY, *COSTS):
+            found = {key: round(v.mean, metric.digits) for key in mine if (v := values[key][metric.key]) is not None}
+            if metric.higher_is_better is None or len(found) < 2:
+                continue
+            order = sorted(set(found.values()), reverse=metric.higher_is_better)
+            for key, value in found.items():
+                better = sum(other > value if metric.higher_is_better else other < value for other in found.values())
+                if better < 3 and value in order:
+                    ranks[key][metric.key] = better + 1
+    return ranks
+
+
+def _cell(
+    key: tuple[str, str],
+    group: Sequence[Measured],
+    values: Mapping[str, Value | None],
+    ranks: Mapping[str, int],
+    spec: TableSpec,
+) -> Cell:
+    first = group[0].evaluation
+    paper = PAPER_SCORES.get((key[0], group[0].paper_scene)) if spec.data != OWN_DATA else None
+    seeds = tuple(sorted(run.seed for run in group))
+    return Cell(*key, values, ranks, paper, seeds, first.facts.preset, first.resolution, len(first.rows))

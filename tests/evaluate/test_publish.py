@@ -1,0 +1,110 @@
+from __future__ import annotations
+
+import csv
+import io
+
+import pytest
+
+from rtgs.evaluate.evaluate import METRICS, EvaluationTable, RunFacts, ViewScore
+from rtgs.evaluate.publish import Measured, TableSpec, build_table
+from rtgs.evaluate.table_formats import comma_separated, latex, markdown, page, write_table
+
+
+def run(method: str, scene: str, psnr: float, *, seed: int = 0, lpips: float | None = 0.2, masked: float | None = None):
+    values: dict[str, float | None] = dict.fromkeys(METRICS)
+    values |= {"psnr": psnr, "ssim": 0.9, "lpips_01": lpips, "psnr_masked": masked}
+    rows = tuple(ViewScore(f"{k}.png", 64, 48, None, dict(values)) for k in range(2))
+    facts = RunFacts(scene, method, "quick", 2000, 1000, 60.0, 500.0)
+    return Measured(EvaluationTable(facts, rows), seed, paper_scene={"ball_statue": "ballstatue"}.get(scene, scene))
+
+
+STAND_IN = TableSpec("table2", "Table 2", "stand_in")
+
+
+def test_places_go_to_the_best_of_each_scene_and_ties_share_them():
+    runs = [run("3dgs", "a", 25.0), run("envgs", "a", 27.0), run("rtgs", "a", 27.004), run("2dgs", "a", 24.0)]
+    table = build_table(STAND_IN, [*runs, run("rtgs", "b", 20.0)])
+    places = {method: cell.ranks.get("psnr") for (method, scene), cell in table.cells.items() if scene == "a"}
+    assert places == {"3dgs": 3, "envgs": 1, "rtgs": 1, "2dgs": None}  # equal to the printed digit
+    alone = table.cell("rtgs", "b")
+    assert alone is not None
+    assert alone.ranks == {}
+    assert table.cell("3dgs", "b") is None
+
+
+def test_lower_is_better_for_lpips():
+    table = build_table(STAND_IN, [run("envgs", "a", 25.0, lpips=0.3), run("rtgs", "a", 24.0, lpips=0.2)])
+    ranks = {method: cell.ranks for (method, _), cell in table.cells.items()}
+    assert ranks["rtgs"]["lpips_01"] == 1
+    assert ranks["envgs"]["lpips_01"] == 2
+
+
+def test_seeds_give_mean_and_sample_deviation():
+    table = build_table(STAND_IN, [run("rtgs", "a", psnr, seed=k) for k, psnr in enumerate((24.0, 25.0, 26.0))])
+    cell = table.cell("rtgs", "a")
+    assert cell is not None
+    value = cell.values["psnr"]
+    assert value is not None
+    assert (value.mean, value.spread, value.seeds) == (25.0, 1.0, 3)
+    assert "25.00 ± 1.00" in markdown(table)
+    assert r"25.00 $\pm$ 1.00" in latex(table)
+    assert "over 3 seeds" in page(table)
+
+
+def test_stand_ins_are_shown_beside_the_paper_and_never_subtracted():
+    text = markdown(build_table(STAND_IN, [run("rtgs", "ball_statue", 30.0), run("envgs", "ball_statue", 29.0)]))
+    assert "26.05 / 0.885 / 0.174" in text
+    assert "not comparable" in text
+    assert "ours - paper's" not in text
+    assert "+3.95" not in text
+
+
+def test_on_the_papers_data_the_difference_has_its_own_column():
+    table = build_table(TableSpec("table2", "Table 2", "paper"), [run("rtgs", "ball_statue", 26.153)])
+    assert "| +0.10 |" in markdown(table)
+    row = next(csv.DictReader(io.StringIO(comma_separated(table))))
+    assert float(row["psnr_minus_paper"]) == pytest.approx(0.1)
+    assert "stand-in" not in markdown(table)
+
+
+def test_own_scenes_have_no_paper():
+    assert "paper" not in markdown(build_table(TableSpec("t", "My captures"), [run("rtgs", "sedan", 30.0)])).lower()
+
+
+def test_what_was_not_measured_says_so():
+    text = markdown(build_table(STAND_IN, [run("rtgs", "a", 30.0, lpips=None)]))
+    assert "n/a" in text
+    assert "LPIPS: not measured" in text
+    assert "in the mask" not in text.split("## ")[1].splitlines()[2]  # a cost column that nobody has is left out
+
+
+def test_four_files_that_hold_the_same_figures(tmp_path):
+    table = build_table(STAND_IN, [run("rtgs", "a_b", 30.125, masked=22.5), run("2dgs", "a_b", 29.0, masked=21.0)])
+    paths = write_table(tmp_path / "table2", table)
+    assert [path.name for path in paths] == ["table.md", "table.csv", "table.tex", "table.html"]
+    texts = {path.suffix: path.read_text() for path in paths}
+    assert "**30.12**" in texts[".md"]
+    assert r"\textbf{30.12}" in texts[".tex"]
+    assert r"a\_b" in texts[".tex"]
+    assert "<b class=first>30.12</b>" in texts[".html"]
+    rows = list(csv.DictReader(io.StringIO(texts[".csv"])))
+    assert [(row["method"], float(row["psnr"]), float(row["psnr_masked"])) for row in rows] == [
+        ("rtgs", 30.125, 22.5),
+        ("2dgs", 29.0, 21.0),
+    ]
+    assert not list(tmp_path.rglob("*.tmp"))
+
+
+def test_names_cannot_break_the_page():
+    text = page(build_table(STAND_IN, [run("<script>", "a|b", 30.0)]))
+    assert "<script>" not in text
+    assert "a\\|b" in markdown(build_table(STAND_IN, [run("m", "a|b", 30.0)]))
+
+
+def test_the_same_run_twice_and_no_run_are_refused():
+    with pytest.raises(ValueError, match="comes twice"):
+        build_table(STAND_IN, [run("rtgs", "a", 30.0), run("rtgs", "a", 31.0)])
+    with pytest.raises(ValueError, match="has no runs"):
+        build_table(STAND_IN, [])
+    with pytest.raises(ValueError, match=r"table\.data='mine'"):
+        TableSpec("t", "T", "mine")
