@@ -27,6 +27,7 @@ log = logging.getLogger("rtgs")
 class RunOutcome:
     """What a run gave."""
 
+    config: RunConfig
     plan: Plan
     results: tuple[StepResult, ...]
     folder: Path
@@ -68,7 +69,7 @@ def execute(config: RunConfig, choices: Choices) -> RunOutcome:
     log.info("%s", describe(plan))
     results, folder = _run(config, choices, _Stores(store, remote), plan, command(choices))
     _show(results, folder)
-    return RunOutcome(plan, results, folder)
+    return RunOutcome(config, plan, results, folder)
 
 
 def _run(
@@ -188,10 +189,18 @@ class HydraApp:
         from pipelines.results import evaluation_of, result_table
 
         parts = [result_table([evaluation_of(outcome.results) for outcome in self.outcomes])] if self.outcomes else []
+        if paths := self.tables():
+            parts.append("\n".join(f"table: {_short(path)}" for path in paths))
         if self.failures:
             total = len(self.outcomes) + len(self.failures)
             parts.append("\n".join([f"{len(self.failures)} of {total} jobs failed:", *self.failures]))
         return "\n\n".join(parts)
+
+    def tables(self) -> list[Path]:
+        """Write the table that the experiment asks for, of the jobs that succeeded; the paths written."""
+        from pipelines.tables import write_experiment_table
+
+        return write_experiment_table([(outcome.config, outcome.results) for outcome in self.outcomes])
 
 
 def run_hydra(arguments: Sequence[str]) -> None:

@@ -29,7 +29,7 @@ KINDS: tuple[StepKind, ...] = (
 )
 """Every kind of step there is; the guard against forgotten version bumps goes through them."""
 
-_NOT_SHOWN = ("paths.", "tracking.", "name", "threads", "scene.path", "method.paper_schedule.")
+_NOT_SHOWN = ("paths.", "tracking.", "table.", "name", "threads", "scene.path", "method.paper_schedule.")
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,11 @@ class PathsConfig:
         return Path(self.root) / "store"
 
     @property
+    def tables(self) -> Path:
+        """One folder per table of an experiment."""
+        return Path(self.root) / "tables"
+
+    @property
     def runs(self) -> Path:
         """One folder per run with what people look at."""
         return Path(self.root) / "runs"
@@ -83,6 +88,19 @@ class MeshConfig:
 
 
 @dataclass(frozen=True)
+class TableConfig:
+    """The table that a sweep ends with (:mod:`rtgs.evaluate.publish`); set by files of ``conf/experiment``."""
+
+    name: str = ""
+    """Folder under ``<root>/tables``, the preset is added. Empty: no table is written."""
+    title: str = ""
+    data: str = "own"
+    """``stand_in`` (scenes named after the paper's), ``paper`` (its data: differences are formed) or ``own``."""
+    paper_scenes: dict[str, str] = field(default_factory=dict)
+    """The paper's name of a scene by ours, where they differ."""
+
+
+@dataclass(frozen=True)
 class Choices:
     """The files chosen from the config groups: names for tables, folders and the report."""
 
@@ -107,6 +125,7 @@ class RunConfig:
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     mesh: MeshConfig = field(default_factory=MeshConfig)
     ablation: AblationConfig = field(default_factory=AblationConfig)
+    table: TableConfig = field(default_factory=TableConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     paths: PathsConfig = field(default_factory=PathsConfig)
     seed: int = 0

@@ -75,7 +75,10 @@ def test_a_sweep_is_one_plan_and_every_job_has_its_results(capture, tmp_path, ca
         "row-2dgs-smoke-no_normal_loss-seed1",
         "row-2dgs-smoke-seed1",
     ]
-    assert captured.out.strip().splitlines()[-5].split()[:2] == ["scene", "method"]
+    assert ["scene", "method"] in [line.split()[:2] for line in captured.out.splitlines()]
+    table = (tmp_path / "tables" / "mine-smoke" / "table.md").read_text()
+    assert "over 2 seeds" in table
+    assert [line.split("|")[1].strip() for line in table.splitlines()[4:6]] == ["2dgs", "2dgs, no_normal_loss"]
     first_events = [path.read_text().splitlines()[0] for path in (tmp_path / "tracking").rglob("events.jsonl")]
     names = [json.loads(line)["name"].split()[0] for line in first_events]
     assert names.count("train_diffuse") == 4

@@ -1,0 +1,33 @@
+"""The table that an experiment ends with, from the runs of its sweep."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from pipelines.results import evaluation_of
+from rtgs.config.schema import RunConfig
+from rtgs.evaluate.publish import Measured, TableSpec, build_table
+from rtgs.evaluate.table_formats import write_table
+from rtgs.pipeline import StepResult
+
+
+def write_experiment_table(runs: Sequence[tuple[RunConfig, Sequence[StepResult]]]) -> list[Path]:
+    """Write ``<root>/tables/<name>-<preset>/table.{md,csv,tex,html}``; nothing where no table is asked for.
+
+    Raises:
+        ValueError: ``table.data`` is unknown, or a combination comes twice.
+    """
+    asked = [(config, results) for config, results in runs if config.table.name]
+    if not asked:
+        return []
+    config = asked[0][0]
+    names = config.table.paper_scenes
+    measured = []
+    for one, results in asked:
+        evaluation = evaluation_of(results)
+        scene = evaluation.facts.scene
+        measured.append(Measured(evaluation, one.seed, names.get(scene, scene)))
+    preset = measured[0].evaluation.facts.preset
+    spec = TableSpec(config.table.name, config.table.title or config.table.name, config.table.data)
+    return list(write_table(config.paths.tables / f"{config.table.name}-{preset}", build_table(spec, measured)))
