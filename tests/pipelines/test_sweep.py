@@ -60,6 +60,7 @@ def test_a_sweep_is_one_plan_and_every_job_has_its_results(capture, tmp_path, ca
         f"scene={capture}",
         *QUICK,
         "tracking=jsonl",
+        "table.name=mine",
         "ablation=none,no_normal_loss",
         "seed=0,1",
     ]
