@@ -40,12 +40,13 @@ def import_scene(params: ImportParams, context: StepContext) -> None:
 
 STEP = StepKind(
     "import_scene",
-    2,
+    3,
     import_scene,
     helpers=(
         "rtgs.scenes.canonical",
         "rtgs.scenes.scene",
         "rtgs.scenes.images",
+        "rtgs.scenes.truth",
         "rtgs.scenes.points",
         "rtgs.scenes.splits",
         "rtgs.scenes.undistort",

@@ -16,6 +16,7 @@ from rtgs.scenes.capture import Capture, CaptureView, Finding, existing_side_fil
 from rtgs.scenes.images import MASK_SUFFIXES, NORMAL_SUFFIXES
 from rtgs.scenes.settings import CaptureError, SceneSettings
 from rtgs.scenes.transforms import locate_image, read_json, size_on_disk, world_to_camera
+from rtgs.scenes.truth import existing_truth
 from rtgs.scenes.undistort import Lens
 
 RANDOM_BOX = 1.3
@@ -84,6 +85,7 @@ def _view(index: int, frame: Any, angle: float, path: Path, settings: SceneSetti
         lens=_lens(size, angle) if size else None,
         mask=existing_side_file(root / masks, name, MASK_SUFFIXES) if masks else None,
         normal=existing_side_file(root / normals, name, NORMAL_SUFFIXES) if normals else None,
+        truth=existing_truth(root, name),
     )
 
 

@@ -23,10 +23,12 @@ from rtgs.scenes.findings import missing_files
 from rtgs.scenes.importers import read_capture
 from rtgs.scenes.scene import Scene, View, select_views
 from rtgs.scenes.settings import CaptureError, SceneSettings
+from rtgs.scenes.truth import ViewTruth, truth_files
 
 FORMAT_VERSION = 1
 SCENE_FILE = "scene.json"
 POINTS_FILE = "points.safetensors"
+_TRUTH_PREFIX = "truth."
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,8 @@ def save_scene(scene: Scene, folder: Path) -> None:
     for index, (part, view) in enumerate(views):
         file = f"views/{index:05d}.safetensors"
         tensors = {"image": view.image, "mask": view.mask, "normal": view.normal}
+        if view.truth is not None:
+            tensors |= {f"{_TRUTH_PREFIX}{name}": tensor for name, tensor in view.truth.tensors().items()}
         save_file({key: t.contiguous() for key, t in tensors.items() if t is not None}, folder / file)
         entries[part].append(asdict(_entry(view, file)))
     save_file(
@@ -130,7 +134,17 @@ def _view(folder: Path, entry: _ViewEntry) -> View:
         entry.height,
         name=entry.camera_name,
     )
-    return View(camera, tensors["image"], tensors.get("mask"), tensors.get("normal"), entry.name)
+    truth = {
+        key.removeprefix(_TRUTH_PREFIX): tensor for key, tensor in tensors.items() if key.startswith(_TRUTH_PREFIX)
+    }
+    return View(
+        camera,
+        tensors["image"],
+        tensors.get("mask"),
+        tensors.get("normal"),
+        entry.name,
+        ViewTruth(**truth) if truth else None,
+    )
 
 
 def capture_digest(settings: SceneSettings) -> str:
@@ -147,6 +161,8 @@ def capture_digest(settings: SceneSettings) -> str:
     files = set(capture.model_files)
     for view in select_views(capture, settings):
         files |= {path for path in (view.image, view.mask, view.normal) if path is not None}
+        if view.truth is not None:
+            files |= set(truth_files(view.truth))
     if settings.split_file is not None:
         files.add(capture.root / settings.split_file)
     digest = hashlib.sha256(f"{capture.format}\n".encode())

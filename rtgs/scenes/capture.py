@@ -43,6 +43,7 @@ class CaptureView:
     lens: Lens | None  # None: neither the capture nor a readable photo tells the image size
     mask: Path | None = None
     normal: Path | None = None
+    truth: Path | None = None  # folder of :mod:`rtgs.scenes.truth`
 
     @property
     def center(self) -> np.ndarray:

@@ -12,6 +12,7 @@ import numpy as np
 from rtgs.scenes.capture import Capture, CaptureView, Finding, PointCloud, existing_side_file, list_some
 from rtgs.scenes.images import IMAGE_SUFFIXES, MASK_SUFFIXES, NORMAL_SUFFIXES, image_size
 from rtgs.scenes.settings import CaptureError, SceneSettings
+from rtgs.scenes.truth import existing_truth
 from rtgs.scenes.undistort import Lens
 
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", ".")
@@ -136,6 +137,7 @@ def _view(image: Any, lens: Lens, images_dir: Path, root: Path, settings: SceneS
         lens=lens,
         mask=existing_side_file(root / masks, image.name, MASK_SUFFIXES) if masks else None,
         normal=existing_side_file(root / normals, image.name, NORMAL_SUFFIXES) if normals else None,
+        truth=existing_truth(root, image.name),
     )
 
 

@@ -7,6 +7,7 @@ from collections import Counter
 import numpy as np
 
 from rtgs.scenes.capture import Capture, CaptureView, Finding, list_some
+from rtgs.scenes.truth import truth_files
 from rtgs.scenes.undistort import check_lens
 
 _FEW_VIEWS = 8
@@ -39,6 +40,7 @@ def missing_files(capture: Capture) -> list[Finding]:
         ("images", [view.image for view in capture.views]),
         ("masks", [view.mask for view in capture.views if view.mask]),
         ("normal maps", [view.normal for view in capture.views if view.normal]),
+        ("truth pictures", [path for view in capture.views if view.truth for path in truth_files(view.truth)]),
     ):
         missing = [str(path) for path in paths if not path.is_file()]
         if missing:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -26,6 +27,7 @@ from rtgs.scenes.importers import read_capture
 from rtgs.scenes.points import camera_extent, filter_points, random_points, too_few_points
 from rtgs.scenes.settings import CaptureError, SceneSettings
 from rtgs.scenes.splits import choose_split
+from rtgs.scenes.truth import ViewTruth, read_truth
 from rtgs.scenes.undistort import Lens, undistort_image, undistort_nearest
 
 log = logging.getLogger(__name__)
@@ -40,6 +42,7 @@ class View:
     mask: Tensor | None  # (H, W) bool, True = transparent object
     normal: Tensor | None  # (3, H, W) float32, camera frame (x right, y down, z forward), unit or zero where unknown
     name: str
+    truth: ViewTruth | None = None  # of the test views of path-traced captures
 
 
 @dataclass(frozen=True)
@@ -129,7 +132,7 @@ def load_scene(settings: SceneSettings) -> Scene:
     scene = Scene(
         name=settings.name,
         train=tuple(load_view(by_name[name], settings) for name in split.train),
-        test=tuple(load_view(by_name[name], settings) for name in split.test),
+        test=tuple(load_view(by_name[name], settings, with_truth=True) for name in split.test),
         points=torch.from_numpy(points.positions.astype(np.float32)),
         point_colors=torch.from_numpy(points.colors.astype(np.float32)),
         extent=extent,
@@ -167,8 +170,8 @@ def _scene_points(
     return result.points, f"{origin}, {result.summary}"
 
 
-def load_view(view: CaptureView, settings: SceneSettings) -> View:
-    """Read one photo with its mask and normals, undistort and shrink it.
+def load_view(view: CaptureView, settings: SceneSettings, *, with_truth: bool = False) -> View:
+    """Read one photo with its mask and normals, and its truth where it is wanted and there; undistort and shrink it.
 
     Raises:
         CaptureError: an unreadable file, or sizes that do not belong together.
@@ -185,6 +188,7 @@ def load_view(view: CaptureView, settings: SceneSettings) -> View:
         mask=_load_mask(view, lens, width, height) if view.mask else None,
         normal=_load_normal(view, lens, width, height, settings.normals_frame) if view.normal else None,
         name=view.name,
+        truth=_load_truth(view.truth, view, lens, width, height) if view.truth and with_truth else None,
     )
 
 
@@ -226,6 +230,17 @@ def _load_normal(view: CaptureView, lens: Lens, width: int, height: int, frame: 
         normal = _enlarge(normal, width, height)
     normal = unit_or_zero(area_resize(normal, width, height))
     return torch.from_numpy(np.ascontiguousarray(normal.transpose(2, 0, 1)))
+
+
+def _load_truth(folder: Path, view: CaptureView, lens: Lens, width: int, height: int) -> ViewTruth:
+    truth = read_truth(folder)
+    size = (truth.depth.shape[1], truth.depth.shape[0])
+    if not lens.is_pinhole or size != (lens.width, lens.height):
+        raise CaptureError(
+            f"truth {folder} is of a {size[0]}x{size[1]} pinhole image, its photo {view.image} is {lens.width}x"
+            f"{lens.height} with a {lens.model} lens: truth belongs to the very photo it was made with; remove it"
+        )
+    return truth.resized(width, height)
 
 
 def _enlarge(image: np.ndarray, width: int, height: int) -> np.ndarray:

@@ -15,6 +15,7 @@ import numpy as np
 from rtgs.scenes.capture import Capture, CaptureView, Finding, PointCloud, existing_side_file
 from rtgs.scenes.images import IMAGE_SUFFIXES, MASK_SUFFIXES, NORMAL_SUFFIXES, image_size
 from rtgs.scenes.settings import CaptureError, SceneSettings
+from rtgs.scenes.truth import existing_truth
 from rtgs.scenes.undistort import Lens
 
 TRANSFORMS_FILE = "transforms.json"
@@ -121,7 +122,7 @@ def _view(index: int, frame: Any, shared: dict[str, Any], settings: SceneSetting
     rotation, translation = world_to_camera(frame["transform_matrix"], where)
     lens = _lens({**shared, **frame}, size_on_disk(image), where)
     mask, normal = _side_files(frame, name, root, settings)
-    return CaptureView(name, image, rotation, translation, lens, mask, normal)
+    return CaptureView(name, image, rotation, translation, lens, mask, normal, existing_truth(root, name))
 
 
 def _side_files(

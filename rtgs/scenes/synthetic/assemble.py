@@ -10,6 +10,8 @@ from rtgs.scenes.synthetic.description import Material, SceneDescription, Shape
 from rtgs.scenes.synthetic.geometry import Mesh
 from rtgs.scenes.synthetic.textures import texture
 
+TRANSPARENT = ("thin_glass", "glass")  # kinds of material the masks show
+SPECULAR = (*TRANSPARENT, "mirror", "glossy")  # kinds that reflect what stands around
 _FLAT_KINDS = ("box", "plane")
 
 

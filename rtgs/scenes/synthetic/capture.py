@@ -1,171 +1,228 @@
-"""A described scene as an ordinary COLMAP capture: images/, sparse/0, masks/, normals/ and truth/."""
+"""A described scene as an ordinary COLMAP capture: images/, sparse/0, masks/, normals/, truth/, synthetic.json.
+
+Views are finished one by one in a working folder, each renamed into place as a whole, so that a killed attempt goes on
+where it was and nothing half-written is taken for finished.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import json
+import shutil
+import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from PIL import Image
 
 from rtgs.cameras import Camera
+from rtgs.scenes.synthetic.assemble import SPECULAR, TRANSPARENT
+from rtgs.scenes.synthetic.colmap_text import write_colmap_text
 from rtgs.scenes.synthetic.description import SceneDescription
-from rtgs.scenes.synthetic.geometry import sample_surface
+from rtgs.scenes.synthetic.features import PictureView, feature_points
+from rtgs.scenes.synthetic.layers import LightLayers
+from rtgs.scenes.synthetic.monocular import perturbed_normals, shrunk_normals
+from rtgs.scenes.synthetic.noise import noise_of_mean
+from rtgs.scenes.synthetic.record import CaptureRecord, ViewRecord, noise_psnrs, reflected_share, weighted_share
 from rtgs.scenes.synthetic.render import Geometry, PathTracer
-from rtgs.scenes.synthetic.textures import fractal_noise
+from rtgs.scenes.synthetic.settings import CaptureSettings
 from rtgs.scenes.synthetic.viewpoints import cameras as make_cameras
+from rtgs.scenes.truth import TRUTH_FOLDER, ViewTruth, srgb_from_linear, write_truth
 
+_SIDES = {"image": "images", "mask": "masks", "normal": "normals", "truth": TRUTH_FOLDER}
 
-@dataclass(frozen=True)
-class CaptureSettings:
-    width: int = 320
-    height: int = 240
-    samples: int = 256  # paths a pixel
-    points: int = 6000  # sampled before visibility
-    point_noise: float = 0.004  # metres, standard deviation of the triangulated points
-    min_track: int = 3  # views that must see a point, as a feature matcher wants
-    normal_noise: float = 6.0  # degrees, smooth perturbation of the monocular normals
-    jpeg_quality: int = 95
-    truth: bool = True  # also write truth/: exact depths, normals and shape indices of every view
-    seed: int = 0
+Progress = Callable[[str, float], None]
+"""Called with a view's name and the share of the work that is done, 0..1."""
 
 
 def to_srgb(linear: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Linear radiance to 8-bit sRGB, clipped at 1."""
-    x = np.clip(linear, 0, 1)
-    encoded = np.where(
-        x <= 0.0031308, 12.92 * x, 1.055 * np.power(x, 1 / 2.4, where=x > 0, out=np.zeros_like(x)) - 0.055
-    )
-    return (encoded * 255 + 0.5).astype(np.uint8)
+    return (srgb_from_linear(linear) * 255 + 0.5).astype(np.uint8)
 
 
-def perturbed_normals(normal: NDArray[np.float32], degrees: float, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Exact normals tilted by a smooth random field of ``degrees`` (one standard deviation a component)."""
-    height, width, _ = normal.shape
-    size = 1 << max(height, width).bit_length()
-    field = np.stack([fractal_noise(size, rng, octaves=3, periodic_power=1.5)[:height, :width] for _ in range(3)], -1)
-    tilt = (field - field.mean((0, 1))) / field.std((0, 1)) * np.tan(np.radians(degrees))
-    tilted = normal + tilt
-    length = np.linalg.norm(tilted, axis=-1, keepdims=True)
-    known = np.linalg.norm(normal, axis=-1, keepdims=True) > 0.5
-    return np.where(known, tilted / np.maximum(length, 1e-6), 0).astype(np.float32)
-
-
-def feature_points(
-    tracer: PathTracer, views: list[Camera], see_through: list[Geometry], settings: CaptureSettings
-) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Points a feature matcher would triangulate: on textured shapes, also *through* the glass, none on the glass."""
-    import torch
-
-    rng = np.random.default_rng(settings.seed + 1)
-    described = tracer.description
-    textured = [s for s in described.shapes if s.material.kind in ("diffuse", "glossy") and s.emission is None]
-    areas = np.array([np.ptp(tracer.meshes[s.name].vertices, axis=0).max() for s in textured])
-    share = areas**0.7 / (areas**0.7).sum()  # small objects hold more features than their area says
-    samples = [
-        sample_surface(tracer.meshes[s.name], int(np.ceil(w * settings.points)), rng)[0]
-        for s, w in zip(textured, share)
-    ]
-    points = np.concatenate(samples)
-    track = np.zeros(len(points), int)
-    for camera, geometry in zip(views, see_through):
-        pixel, depth = (t.numpy() for t in camera.project(torch.from_numpy(points)))
-        x, y = np.floor(pixel).T
-        inside = (depth > 0.05) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
-        surface = np.zeros(len(points))
-        surface[inside] = geometry.depth[y[inside].astype(int), x[inside].astype(int)]
-        track += inside & (np.abs(surface - depth) < 0.02 * depth)
-    kept = points[track >= settings.min_track]
-    return kept + rng.normal(0, settings.point_noise, kept.shape), track[track >= settings.min_track].astype(np.uint8)
-
-
-def _point_colors(
-    points: NDArray[np.float64], views: list[Camera], pictures: list[NDArray[np.uint8]], depths: list[Geometry]
-) -> NDArray[np.uint8]:
-    """Mean colour of each point over the views that see it."""
-    import torch
-
-    total, seen = np.zeros((len(points), 3)), np.zeros(len(points))
-    for camera, picture, geometry in zip(views, pictures, depths):
-        pixel, depth = (t.numpy() for t in camera.project(torch.from_numpy(points)))
-        x, y = np.floor(pixel).T
-        inside = np.flatnonzero((depth > 0.05) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height))
-        row, column = y[inside].astype(int), x[inside].astype(int)
-        visible = np.abs(geometry.depth[row, column] - depth[inside]) < 0.03 * depth[inside]
-        total[inside[visible]] += picture[row[visible], column[visible]]
-        seen[inside[visible]] += 1
-    return np.where(seen[:, None] > 0, total / np.maximum(seen, 1)[:, None], 128).astype(np.uint8)
-
-
-def write_colmap_text(
-    folder: Path, views: list[Camera], points: NDArray[np.float64], colors: NDArray[np.uint8]
-) -> None:
-    """``sparse/0`` in COLMAP's text format; one shared PINHOLE camera, tracks left empty."""
-    from scipy.spatial.transform import Rotation
-
-    folder.mkdir(parents=True, exist_ok=True)
-    c = views[0]
-    (folder / "cameras.txt").write_text(f"1 PINHOLE {c.width} {c.height} {c.fx!r} {c.fy!r} {c.cx!r} {c.cy!r}\n")
-    lines = []
-    for number, camera in enumerate(views, start=1):
-        x, y, z, w = Rotation.from_matrix(camera.rotation.numpy()).as_quat()
-        pose = " ".join(repr(float(v)) for v in (w, x, y, z, *camera.translation.numpy()))
-        lines.append(f"{number} {pose} 1 {camera.name}.jpg\n\n")
-    (folder / "images.txt").write_text("".join(lines))
-    rows = (
-        f"{i} {p[0]:.5f} {p[1]:.5f} {p[2]:.5f} {c[0]} {c[1]} {c[2]} 0.5\n"
-        for i, (p, c) in enumerate(zip(points, colors), start=1)
-    )
-    (folder / "points3D.txt").write_text("".join(rows))
-
-
-def _write_truth(file: Path, first: Geometry, behind: Geometry) -> None:
-    """Exact geometry of one view: the visible surfaces, and what stands behind the glass."""
-    np.savez_compressed(
-        file,
-        depth=first.depth,
-        depth_behind=behind.depth,
-        normal=first.normal.astype(np.float16),
-        shape=first.shape.astype(np.int8),
-    )
+def description_digest(description: SceneDescription) -> str:
+    """SHA-256 of what a description means, whatever file it was read from."""
+    return hashlib.sha256(json.dumps(asdict(description), sort_keys=True).encode()).hexdigest()
 
 
 def write_capture(
     description: SceneDescription,
     folder: Path,
+    work: Path,
     settings: CaptureSettings | None = None,
-    progress: Callable[[str, int, int], None] | None = None,
-) -> None:
-    """Path-trace the scene and write the capture. Deterministic for a seed on one Mitsuba variant."""
-    from PIL import Image
+    *,
+    variant: str | None = None,
+    progress: Progress | None = None,
+) -> CaptureRecord:
+    """Path-trace the scene and write the capture. Deterministic for a seed on one Mitsuba variant.
 
+    Args:
+        description: the scene.
+        folder: where the capture goes.
+        work: where finished views are kept until all are there; a later call with the same arguments goes on from it.
+        settings: size, samples, side files.
+        variant: of Mitsuba; None: the fastest here.
+        progress: told of every view.
+
+    Raises:
+        RtgsError: Mitsuba or the wanted variant is not there.
+        OSError: a file cannot be written (disk full); finished views stay in ``work``.
+    """
     settings = settings or CaptureSettings()
-    tracer = PathTracer(description, settings.seed)
+    tracer = PathTracer(description, settings.seed, variant)
     views = make_cameras(description.viewpoints, settings.width, settings.height, settings.seed)
-    glass = [i for i, s in enumerate(description.shapes) if s.material.kind == "thin_glass"]
-    for name in ("images", "normals", *(["masks"] if glass else []), *(["truth"] if settings.truth else [])):
-        (folder / name).mkdir(parents=True, exist_ok=True)
-    pictures, see_through = [], []
-    for number, camera in enumerate(views):
+    for leftover in work.glob("*.tmp"):
+        shutil.rmtree(leftover)
+    costs = np.array([settings.view_samples(index) for index in range(len(views))], float)
+    records = []
+    for index, camera in enumerate(views):
         if progress:
-            progress(camera.name, number, len(views))
-        rng = np.random.default_rng((settings.seed, number))
-        picture = to_srgb(tracer.image(camera, settings.samples))
-        first = tracer.geometry(camera)
-        behind = tracer.geometry(camera, without_glass=True)
-        mask = np.isin(first.shape, glass)
-        mono = perturbed_normals(first.normal, settings.normal_noise, rng)
-        image_file = folder / "images" / f"{camera.name}.jpg"
-        Image.fromarray(picture).save(image_file, quality=settings.jpeg_quality, subsampling=0)
-        if glass:
-            Image.fromarray((mask * 255).astype(np.uint8)).save(folder / "masks" / f"{camera.name}.png", optimize=True)
-        encoded = np.clip((mono + 1) * 127.5 + 0.5, 0, 255).astype(np.uint8)
-        Image.fromarray(encoded).save(folder / "normals" / f"{camera.name}.png", optimize=True)
-        if settings.truth:
-            _write_truth(folder / "truth" / f"{camera.name}.npz", first, behind)
-        pictures.append(picture)
-        see_through.append(behind)
-    points, _ = feature_points(tracer, views, see_through, settings)
-    colors = _point_colors(points, views, pictures, see_through)
-    write_colmap_text(folder / "sparse" / "0", views, points, colors)
+            progress(camera.name, costs[:index].sum() / costs.sum())
+        records.append(_finished_view(tracer, camera, index, settings, work))
+    if progress:
+        progress("points", 1.0)
+    return _assemble(tracer, views, records, settings, folder, work)
+
+
+def _finished_view(tracer: PathTracer, camera: Camera, index: int, settings: CaptureSettings, work: Path) -> ViewRecord:
+    place = work / camera.name
+    if not place.is_dir():
+        temporary = work / f"{camera.name}.tmp"
+        temporary.mkdir(parents=True)
+        _write_view(tracer, camera, index, settings, temporary)
+        temporary.rename(place)
+    return ViewRecord.read(place)
+
+
+def _write_view(tracer: PathTracer, camera: Camera, index: int, settings: CaptureSettings, folder: Path) -> None:
+    """Render one view and write its files: image, mask (scenes with glass), normal, truth (where wanted), record."""
+    began = time.perf_counter()
+    layers, noise = _rendered(tracer, camera, index, settings)
+    geometry = tracer.geometry(camera)
+    masked, specular = (_shows(tracer.description, geometry, kinds) for kinds in (TRANSPARENT, SPECULAR))
+    name = f"image.{_suffix(settings, index)}"
+    picture = Image.fromarray(to_srgb(layers.image))
+    if settings.is_test(index):
+        picture.save(folder / name, optimize=True)
+    else:
+        picture.save(folder / name, quality=settings.jpeg_quality, subsampling=0, optimize=True)
+    if _has_glass(tracer.description):
+        Image.fromarray(masked).save(folder / "mask.png", optimize=True)
+    rng = np.random.default_rng((settings.seed, index))
+    mono = perturbed_normals(geometry.normal, settings.normal_tilt, settings.normal_noise, rng)
+    encoded = np.clip((shrunk_normals(mono, settings.normal_scale) + 1) * 127.5 + 0.5, 0, 255).astype(np.uint8)
+    Image.fromarray(encoded).save(folder / "normal.png", optimize=True)
+    if settings.has_truth(index):
+        write_truth(folder / "truth", _truth(layers, geometry, specular))
+    ViewRecord(
+        image=f"{camera.name}.{_suffix(settings, index)}",
+        samples=settings.view_samples(index),
+        seconds=round(time.perf_counter() - began, 3),
+        masked=float(masked.mean()),
+        specular=float(specular.mean()),
+        reflected_in_mask=reflected_share(layers, masked),
+        reflected_in_specular=reflected_share(layers, specular),
+        noise=noise,
+    ).write(folder)
+
+
+def _rendered(
+    tracer: PathTracer, camera: Camera, index: int, settings: CaptureSettings
+) -> tuple[LightLayers, float | None]:
+    """The layers of a view; of a test view from two halves with independent seeds, and the noise they tell."""
+    if not settings.is_test(index):
+        return tracer.layers(camera, settings.samples), None
+    halves = [tracer.layers(camera, settings.test_samples // 2, stream) for stream in (1, 2)]
+    return LightLayers.mean(halves), noise_of_mean(halves[0].image, halves[1].image)
+
+
+def _truth(layers: LightLayers, geometry: Geometry, specular: NDArray[np.bool_]) -> ViewTruth:
+    def channels_first(pixels: NDArray[np.float32]) -> torch.Tensor:
+        return torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1)))
+
+    return ViewTruth(
+        depth=torch.from_numpy(geometry.depth),
+        second_depth=torch.from_numpy(geometry.second_depth),
+        normal=channels_first(geometry.normal),
+        objects=torch.from_numpy(geometry.shape.astype(np.int16)),
+        specular=torch.from_numpy(specular),
+        diffuse=channels_first(layers.diffuse),
+        reflected=channels_first(layers.reflected),
+        transmitted=channels_first(layers.transmitted),
+    )
+
+
+def _shows(description: SceneDescription, geometry: Geometry, kinds: tuple[str, ...]) -> NDArray[np.bool_]:
+    chosen = [index for index, shape in enumerate(description.shapes) if shape.material.kind in kinds]
+    return np.isin(geometry.shape, chosen)
+
+
+def _has_glass(description: SceneDescription) -> bool:
+    return any(shape.material.kind in TRANSPARENT for shape in description.shapes)
+
+
+def _suffix(settings: CaptureSettings, index: int) -> str:
+    return "png" if settings.is_test(index) else "jpg"
+
+
+def _assemble(
+    tracer: PathTracer,
+    views: list[Camera],
+    records: list[ViewRecord],
+    settings: CaptureSettings,
+    folder: Path,
+    work: Path,
+) -> CaptureRecord:
+    """Copy the finished views to where captures have them; points, model and record beside them."""
+    for camera in views:
+        for path in (work / camera.name).iterdir():
+            if side := _SIDES.get(path.stem):
+                place = folder / side / f"{camera.name}{path.suffix}"
+                place.parent.mkdir(parents=True, exist_ok=True)
+                (shutil.copytree if path.is_dir() else shutil.copyfile)(path, place)
+    pictures = [
+        PictureView(
+            camera,
+            np.asarray(Image.open(folder / "images" / record.image)),
+            tracer.geometry(camera, without_glass=True),
+        )
+        for camera, record in zip(views, records)
+    ]
+    points, colors = feature_points(tracer, pictures, settings.features, settings.seed)
+    named = [(camera, record.image) for camera, record in zip(views, records)]
+    write_colmap_text(folder / "sparse" / "0", named, points, colors)
+    record = _capture_record(tracer, records, settings, len(points))
+    record.write(folder)
+    return record
+
+
+def _capture_record(
+    tracer: PathTracer, views: list[ViewRecord], settings: CaptureSettings, points: int
+) -> CaptureRecord:
+    noise = noise_psnrs(views)
+    description = tracer.description
+    return CaptureRecord(
+        name=description.name,
+        title=description.title,
+        stand_in_for=getattr(description, "stand_in_for", ""),
+        description_sha256=description_digest(description),
+        renderer=tracer.renderer,
+        width=settings.width,
+        height=settings.height,
+        views=len(views),
+        samples=settings.samples,
+        test_samples=settings.test_samples,
+        seed=settings.seed,
+        points=points,
+        seconds=round(sum(view.seconds for view in views), 1),
+        noise_psnr=round(float(np.mean(noise)), 2),
+        noise_psnr_worst=round(float(np.min(noise)), 2),
+        masked=round(float(np.mean([view.masked for view in views])), 4),
+        specular=round(float(np.mean([view.specular for view in views])), 4),
+        reflected_in_mask=weighted_share(views, "reflected_in_mask", "masked"),
+        reflected_in_specular=weighted_share(views, "reflected_in_specular", "specular"),
+    )

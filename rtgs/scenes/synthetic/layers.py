@@ -30,6 +30,15 @@ class LightLayers:
         """(H, W, 3) linear light, not clipped."""
         return self.diffuse + self.reflected + self.transmitted
 
+    @staticmethod
+    def mean(renders: list[LightLayers]) -> LightLayers:
+        """Independent renders of one view as one."""
+        diffuse, reflected, transmitted = (
+            np.mean([getattr(layers, name) for layers in renders], axis=0)
+            for name in ("diffuse", "reflected", "transmitted")
+        )
+        return LightLayers(diffuse, reflected, transmitted)
+
 
 class FirstSurface:
     """Follows rays of one scene; ``mi`` is Mitsuba in the variant the scene was loaded in."""

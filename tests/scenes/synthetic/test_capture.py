@@ -7,10 +7,13 @@ from PIL import Image
 
 mitsuba = pytest.importorskip("mitsuba", reason="path tracing needs the extra 'synthetic'")
 
-from rtgs.scenes.synthetic.capture import CaptureSettings, to_srgb, write_capture  # noqa: E402
+from rtgs.scenes.images import read_normals  # noqa: E402
+from rtgs.scenes.synthetic.capture import to_srgb, write_capture  # noqa: E402
 from rtgs.scenes.synthetic.description import Material, SceneDescription, Shape, Viewpoints  # noqa: E402
 from rtgs.scenes.synthetic.render import PathTracer  # noqa: E402
+from rtgs.scenes.synthetic.settings import CaptureSettings, FeatureSettings  # noqa: E402
 from rtgs.scenes.synthetic.viewpoints import cameras  # noqa: E402
+from rtgs.scenes.truth import read_truth  # noqa: E402
 
 GLASS = Material(kind="thin_glass")
 
@@ -58,29 +61,34 @@ def test_capture_on_disk_is_a_colmap_capture_with_masks_normals_and_truth(tmp_pa
     lamp = Shape("lamp", "plane", position=(0, 0, 2.9), size=(1.5, 1.5, 0), tilt=180, emission=(3.0, 3.0, 3.0))
     ball = Shape("ball", "sphere", material=GLASS, size=(0.4, 0, 0))
     core = Shape("core", "box", size=(0.15, 0.15, 0.15), material=Material(texture="checker"))
-    settings = CaptureSettings(width=48, height=36, samples=4, points=3000)
+    features = FeatureSettings(points=500)
+    settings = CaptureSettings(width=48, height=36, samples=4, test_samples=8, features=features)
     described = description(room, lamp, ball, core)
-    write_capture(described, tmp_path, settings)
+    capture = tmp_path / "capture"
+    write_capture(described, capture, tmp_path / "work", settings)
 
     model = pycolmap.Reconstruction()
-    model.read_text(str(tmp_path / "sparse" / "0"))
+    model.read_text(str(capture / "sparse" / "0"))
     assert model.num_images() == 6
     assert model.num_points3D() > 50
     expected = cameras(described.viewpoints, 48, 36)
     for image in model.images.values():
-        camera = next(c for c in expected if f"{c.name}.jpg" == image.name)
+        camera = next(c for c in expected if c.name == image.name.partition(".")[0])
         pose = np.asarray(image.cam_from_world().matrix())
         np.testing.assert_allclose(pose[:, :3], camera.rotation.numpy(), atol=1e-9)
         np.testing.assert_allclose(pose[:, 3], camera.translation.numpy(), atol=1e-9)
-        mask = np.asarray(Image.open(tmp_path / "masks" / f"{camera.name}.png")) > 0
-        truth = np.load(tmp_path / "truth" / f"{camera.name}.npz")
-        np.testing.assert_array_equal(mask, truth["shape"] == 2)
+        mask = np.asarray(Image.open(capture / "masks" / f"{camera.name}.png")) > 0
+        truth = read_truth(capture / "truth" / camera.name)
+        np.testing.assert_array_equal(mask, truth.objects.numpy() == 2)
+        np.testing.assert_array_equal(mask, truth.specular.numpy())
         assert 0.01 < mask.mean() < 0.6
-        normal = np.asarray(Image.open(tmp_path / "normals" / f"{camera.name}.png")) / 127.5 - 1
-        cosine = (normal * truth["normal"]).sum(-1)[truth["depth"] > 0]
+        estimated = read_normals(capture / "normals" / f"{camera.name}.png")
+        assert estimated.shape == (18, 24, 3)  # half size
+        cosine = (estimated * truth.normal[:, 1::2, 1::2].numpy().transpose(1, 2, 0)).sum(-1)
         assert np.median(cosine) > np.cos(np.radians(15))
         assert np.median(cosine) < 1 - 1e-5  # perturbed, as an estimator's are
-        assert (truth["depth_behind"] >= truth["depth"] - 1e-4).all()
+        behind = truth.second_depth.numpy()
+        assert (behind[mask] > truth.depth.numpy()[mask]).all()  # the core or the far side of the ball
     # no point sits on the glass: they are on the core, the walls or the lamp's room
     points = np.stack([p.xyz for p in model.points3D.values()])
     on_glass = np.abs(np.linalg.norm(points, axis=1) - 0.4) < 0.02

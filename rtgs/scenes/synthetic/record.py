@@ -1,0 +1,111 @@
+"""What is known of a finished view (``record.json``) and of a finished capture (``synthetic.json``)."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rtgs.scenes.settings import CaptureError
+from rtgs.scenes.synthetic.layers import LightLayers
+from rtgs.scenes.synthetic.noise import picture_psnr
+
+CAPTURE_RECORD = "synthetic.json"
+VIEW_RECORD = "record.json"
+
+
+@dataclass(frozen=True)
+class ViewRecord:
+    """Figures of one view. Reflected shares are averages over pixels of reflected / all light, linear."""
+
+    image: str  # file name
+    samples: int
+    seconds: float
+    masked: float  # share of the pixels that show a transparent surface
+    specular: float  # share of the pixels that show a mirror, glossy or transparent surface
+    reflected_in_mask: float | None  # None: no such pixels
+    reflected_in_specular: float | None
+    noise: float | None  # mean squared error against the converged image, sRGB 0..1, before rounding; test views
+
+    def write(self, folder: Path) -> None:
+        """Write ``record.json``."""
+        (folder / VIEW_RECORD).write_text(json.dumps(asdict(self), indent=1) + "\n", encoding="utf-8")
+
+    @staticmethod
+    def read(folder: Path) -> ViewRecord:
+        """Read what :meth:`write` wrote."""
+        return ViewRecord(**json.loads((folder / VIEW_RECORD).read_text(encoding="utf-8")))
+
+
+@dataclass(frozen=True)
+class CaptureRecord:
+    """Figures of a synthetic capture; shares and PSNR are averages over its views."""
+
+    name: str
+    title: str
+    stand_in_for: str  # the scene of a paper whose place it takes in tables; empty: none
+    description_sha256: str  # of the scene file
+    renderer: str  # Mitsuba version and variant
+    width: int
+    height: int
+    views: int
+    samples: int
+    test_samples: int
+    seed: int
+    points: int
+    seconds: float
+    noise_psnr: float  # dB of the test images against a converged render, mean over the test views
+    noise_psnr_worst: float
+    masked: float
+    specular: float
+    reflected_in_mask: float | None
+    reflected_in_specular: float | None
+
+    @property
+    def label(self) -> str:
+        """How tables name it."""
+        return f"{self.name} (stand-in)" if self.stand_in_for else self.name
+
+    def write(self, folder: Path) -> None:
+        """Write ``synthetic.json``."""
+        (folder / CAPTURE_RECORD).write_text(json.dumps(asdict(self), indent=1) + "\n", encoding="utf-8")
+
+    @staticmethod
+    def read(folder: Path) -> CaptureRecord | None:
+        """The record of a capture, None where it has none.
+
+        Raises:
+            CaptureError: the file is there and cannot be read.
+        """
+        path = folder / CAPTURE_RECORD
+        if not path.is_file():
+            return None
+        try:
+            return CaptureRecord(**json.loads(path.read_text(encoding="utf-8")))
+        except (ValueError, TypeError) as error:
+            raise CaptureError(
+                f"{path} cannot be read ({error}): make the capture again, or remove the file"
+            ) from error
+
+
+def reflected_share(layers: LightLayers, where: NDArray[np.bool_]) -> float | None:
+    """Average over the pixels of ``where`` of the share of reflected light, linear."""
+    if not where.any():
+        return None
+    reflected, total = (light.mean(-1)[where] for light in (layers.reflected, layers.image))
+    return float(np.mean(reflected / np.maximum(total, 1e-6)))
+
+
+def noise_psnrs(views: list[ViewRecord]) -> list[float]:
+    """PSNR of every test view against its converged render, dB."""
+    return [picture_psnr(view.noise) for view in views if view.noise is not None]
+
+
+def weighted_share(views: list[ViewRecord], share: str, weight: str) -> float | None:
+    """Average of a share over all pixels of all views that it is about."""
+    pairs = [(getattr(view, share), getattr(view, weight)) for view in views if getattr(view, share) is not None]
+    total = sum(weight for _, weight in pairs)
+    return sum(value * weight for value, weight in pairs) / total if total > 0 else None

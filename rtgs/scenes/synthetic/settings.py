@@ -1,0 +1,84 @@
+"""How a described scene becomes a capture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from rtgs.errors import RtgsError
+
+TRUTHS = ("all", "test", "none")
+_LARGEST_SIDE = 8192
+
+
+@dataclass(frozen=True)
+class FeatureSettings:
+    """How many points, how exact."""
+
+    points: int = 4000
+    """At most this many."""
+    noise: float = 0.004
+    """Standard deviation of a coordinate, metres: the error of triangulation."""
+    min_track: int = 3
+    """Views that must see a point."""
+
+
+@dataclass(frozen=True)
+class CaptureSettings:
+    """Size, samples and side files of a synthetic capture; the defaults are what the shipped captures were made with,
+    which hold the truth of the test views only.
+
+    Raises:
+        RtgsError: a value outside its range.
+    """
+
+    width: int = 256
+    height: int = 192
+    samples: int = 48
+    """Paths a pixel of training views."""
+    test_samples: int = 192
+    """Paths a pixel of test views, rendered as two halves that measure their noise."""
+    test_every: int = 8
+    """Views whose index is divisible by it are test views, as the importer splits them (methods.md 8.1)."""
+    truth: str = "all"
+    """Which views get a truth/ folder: ``all``, ``test`` or ``none``."""
+    jpeg_quality: int = 95
+    """Of training images, without chroma subsampling; test images are PNG."""
+    normal_tilt: float = 6.0
+    """Degrees, smooth error of the monocular normals."""
+    normal_noise: float = 1.0
+    """Degrees, white error of the monocular normals."""
+    normal_scale: float = 0.5
+    """Size of the monocular normal maps, times that of the images."""
+    features: FeatureSettings = field(default_factory=FeatureSettings)
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, least in (("width", 8), ("height", 8), ("samples", 1), ("test_samples", 2), ("test_every", 1)):
+            value = getattr(self, name)
+            if not least <= value <= (_LARGEST_SIDE if name in ("width", "height") else 1 << 20):
+                raise RtgsError(f"synthesize: {name}={value} is out of range, give {least} or more")
+        if self.truth not in TRUTHS:
+            raise RtgsError(f"synthesize: truth={self.truth!r} is unknown: choose one of {', '.join(TRUTHS)}")
+        if not 1 <= self.jpeg_quality <= 100:
+            raise RtgsError(f"synthesize: jpeg_quality={self.jpeg_quality} must lie in 1..100")
+        if not 0 < self.normal_scale <= 1:
+            raise RtgsError(f"synthesize: normal_scale={self.normal_scale} must lie in (0, 1]")
+        for name in ("normal_tilt", "normal_noise", "seed"):
+            if getattr(self, name) < 0:
+                raise RtgsError(f"synthesize: {name}={getattr(self, name)} must not be negative")
+        for name, least in (("points", 1), ("min_track", 1), ("noise", 0)):
+            value = getattr(self.features, name)
+            if value < least:
+                raise RtgsError(f"synthesize: features.{name}={value} is out of range, give {least} or more")
+
+    def is_test(self, index: int) -> bool:
+        """Whether the view of this index in name order is a test view."""
+        return index % self.test_every == 0
+
+    def view_samples(self, index: int) -> int:
+        """Paths a pixel of a view."""
+        return self.test_samples if self.is_test(index) else self.samples
+
+    def has_truth(self, index: int) -> bool:
+        """Whether the view gets a truth folder."""
+        return self.truth == "all" or (self.truth == "test" and self.is_test(index))
