@@ -1,40 +1,9 @@
 // Camera-frame geometry of kLanes surfels (docs/rasterizer.md, "Per surfel"), shared by projection and its backward.
 #pragma once
-#include "raster.h"
-#include "simd.h"
+#include "project_rows.h"
+#include "raster_surfels.h"
 
 namespace rtgs::RTGS_ISA {
-
-struct vec3 {
-  vfloat x, y, z;
-};
-static inline vec3 cross(vec3 a, vec3 b) {
-  return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
-}
-static inline vfloat dot(vec3 a, vec3 b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
-static inline vec3 operator*(vfloat s, vec3 a) { return {s * a.x, s * a.y, s * a.z}; }
-static inline vec3 operator+(vec3 a, vec3 b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
-
-static inline vec3 rotate(const float* r, vec3 a) {  // R a
-  return {r[0] * a.x + r[1] * a.y + r[2] * a.z, r[3] * a.x + r[4] * a.y + r[5] * a.z, r[6] * a.x + r[7] * a.y + r[8] * a.z};
-}
-static inline vec3 rotate_back(const float* r, vec3 a) {  // R^T a
-  return {r[0] * a.x + r[3] * a.y + r[6] * a.z, r[1] * a.x + r[4] * a.y + r[7] * a.z, r[2] * a.x + r[5] * a.y + r[8] * a.z};
-}
-
-// kLanes rows of width components, from row `first`; lanes past the last row repeat it.
-struct RowReader {
-  vint row;
-  RowReader(int64_t first, int64_t count) {
-    for (int lane = 0; lane < kLanes; ++lane) row[lane] = first + lane < count ? lane : int32_t(count - 1 - first);
-  }
-  vfloat component(const float* base, int width, int64_t first, int index) const {
-    return gather(base + first * width + index, row * width);
-  }
-  vec3 vector(const float* base, int64_t first) const {
-    return {component(base, 3, first, 0), component(base, 3, first, 1), component(base, 3, first, 2)};
-  }
-};
 
 struct SurfelGeometry {
   vec3 tangent_u, tangent_v;       // world
@@ -51,19 +20,19 @@ static inline vfloat normal_sign(const SurfelGeometry& g) {
   return select(g.faces_away, broadcast(-1.f), broadcast(1.f));
 }
 
-static inline SurfelGeometry surfel_geometry(const RasterCamera& camera, const SurfelArrays& in, int64_t first) {
+static inline SurfelGeometry surfel_geometry(const RasterCamera& camera, const GaussianArrays& in, int64_t first) {
   SurfelGeometry g;
   RowReader rows(first, in.count);
-  vec3 mean = rows.vector(in.means, first);
-  g.tangent_u = rows.vector(in.tangent_u, first);
-  g.tangent_v = rows.vector(in.tangent_v, first);
-  g.scale_u = rows.component(in.scales, 2, first, 0);
-  g.scale_v = rows.component(in.scales, 2, first, 1);
-  g.opacity = rows.component(in.opacities, 1, first, 0);
-  g.finite_inputs = finite(g.opacity) & finite(g.scale_u) & finite(g.scale_v);
-  const vec3 vectors[] = {mean, g.tangent_u, g.tangent_v};
-  for (const vec3& v : vectors)
-    g.finite_inputs = g.finite_inputs & finite(v.x) & finite(v.y) & finite(v.z);
+  const vec3 mean = rows.vector(in.means);
+  g.tangent_u = rows.vector(in.tangent_u);
+  g.tangent_v = rows.vector(in.tangent_v);
+  vfloat scales[2];
+  rows.read(in.scales, scales);
+  g.scale_u = scales[0];
+  g.scale_v = scales[1];
+  g.opacity = rows.scalar(in.opacities);
+  g.finite_inputs = finite(g.opacity) & finite(g.scale_u) & finite(g.scale_v) & finite(mean) & finite(g.tangent_u) &
+                    finite(g.tangent_v);
 
   const float* t = camera.translation;
   g.p = rotate(camera.rotation, mean) + vec3{broadcast(t[0]), broadcast(t[1]), broadcast(t[2])};

@@ -7,7 +7,7 @@ namespace {
 // Where a surfel can show: an axis-aligned box and, for the test of a block of pixels, its ellipse in conditional form.
 struct ScreenBound {
   vfloat left, right, top, bottom;  // pixels
-  vfloat centre_x, centre_y, slope_y, slope_x, inv_x2, inv_y2_given_x, inv_y2, inv_x2_given_y, disc2;
+  vfloat centre_x, centre_y, conditional[kBoundFields], disc2;
 };
 
 // Bound of a circle that meets the camera plane, where only what lies beyond `near` shows: a rectangle of the plane,
@@ -47,15 +47,12 @@ ScreenBound screen_bound(const RasterCamera& camera, const SurfelGeometry& g, vf
   vfloat xy = x * y + t * (a00 * a10 + a01 * a11);
   vfloat det = sx * camera.fy * (dot(g.n, g.p) * g.inverse_z);  // det A = fx fy n.p / z^3
   vfloat area = t * t * det * det / select(bounded, margin, broadcast(1.f));
-  vfloat wide_x = xx * 1.0001f + 1e-4f, wide_y = yy * 1.0001f + 1e-4f;
+  vfloat wide_x = widened(xx), wide_y = widened(yy);
   s.centre_x = g.mean_x + x;
   s.centre_y = g.mean_y + y;
-  s.slope_y = xy / wide_x;
-  s.slope_x = xy / wide_y;
-  s.inv_x2 = where(bounded, 1.f / wide_x);
-  s.inv_y2 = where(bounded, 1.f / wide_y);
-  s.inv_y2_given_x = where(bounded, 1.f / ((area / wide_x) * 1.0001f + (1e-4f + 1e-10f * yy)));
-  s.inv_x2_given_y = where(bounded, 1.f / ((area / wide_y) * 1.0001f + (1e-4f + 1e-10f * xx)));
+  conditional_form(xx, yy, xy, area, s.conditional);
+  const BoundField variances[] = {kInvX2, kInvY2, kInvY2GivenX, kInvX2GivenY};
+  for (const BoundField k : variances) s.conditional[k] = where(bounded, s.conditional[k]);
   s.disc2 = reach * 0.50005f + 1e-4f;
   vfloat half_x = sqrt(wide_x), half_y = sqrt(wide_y), disc = sqrt(s.disc2);
   s.left = g.mean_x + select(bounded, min(x - half_x, -disc), -disc);
@@ -66,20 +63,10 @@ ScreenBound screen_bound(const RasterCamera& camera, const SurfelGeometry& g, vf
   return s;
 }
 
-// First and last pixel whose centre lies in [low, high], clipped to the image; first > last: none.
-struct PixelRange {
-  vfloat first, last;
-};
-PixelRange pixel_range(vfloat low, vfloat high, int size) {
-  const float limit = float(size);
-  return {max(-floor(clamp(0.5f - low, -limit - 1.f, 1.f)), broadcast(0.f)),
-          min(floor(clamp(high - 0.5f, -1.f, limit + 1.f)), broadcast(limit - 1.f))};
-}
-
 struct Projection {
   vfloat fields[kChannels], depth_scale, depth;
   vec3 normal;          // world, facing the camera
-  vint x0, y0, x1, y1;  // tiles
+  TileBox tiles;
   uint32_t visible;     // bit per lane
 };
 
@@ -93,32 +80,21 @@ Projection project_lanes(const RasterCamera& camera, const SurfelGeometry& g) {
   out.depth = g.p.z;
   out.depth_scale = g.p.z * g.c[6];
   out.normal = normal_sign(g) * cross(g.tangent_u, g.tangent_v);
-  keep = keep & finite(out.normal.x) & finite(out.normal.y) & finite(out.normal.z);
+  keep = keep & finite(out.normal);
   vfloat min_inverse = select(gt(out.depth_scale, broadcast(1e-37f)),
                               camera.near / max(out.depth_scale, broadcast(1e-37f)), broadcast(3e38f));
   const vfloat fields[kChannels] = {
       g.mean_x, g.mean_y, g.c[0], g.c[1], g.c[2], g.c[3], g.c[4], g.c[5], g.c[6], log_opacity, min_inverse,
-      bound.centre_x, bound.centre_y, bound.slope_y, bound.slope_x, bound.inv_x2, bound.inv_y2_given_x, bound.inv_y2,
-      bound.inv_x2_given_y, bound.disc2};
+      bound.centre_x, bound.centre_y, bound.conditional[kSlopeY], bound.conditional[kSlopeX], bound.conditional[kInvX2],
+      bound.conditional[kInvY2GivenX], bound.conditional[kInvY2], bound.conditional[kInvX2GivenY], bound.disc2};
   for (int k = 0; k < kChannels; ++k) {
     out.fields[k] = fields[k];
     keep = keep & finite(fields[k]);
   }
-  PixelRange x = pixel_range(bound.left, bound.right, camera.width);
-  PixelRange y = pixel_range(bound.top, bound.bottom, camera.height);
-  keep = keep & ge(x.last, x.first) & ge(y.last, y.first);
-  out.x0 = truncate(x.first) / kTileSide;
-  out.x1 = truncate(x.last) / kTileSide;
-  out.y0 = truncate(y.first) / kTileSide;
-  out.y1 = truncate(y.last) / kTileSide;
+  out.tiles = TileBox(camera, bound.left, bound.right, bound.top, bound.bottom);
+  keep = keep & out.tiles.meets;
   out.visible = mask_bits(keep);
   return out;
-}
-
-bool all_finite(const float* values, int count) {
-  vmask ok = first_lanes(kLanes);
-  for (int k = 0; k < count; k += kLanes) ok = ok & finite(load_first(values + k, count - k));
-  return !any(mask_not(ok));
 }
 
 void write_channels(const RecordLayout& layout, const Projection& p, int lane, const float* features,
@@ -136,7 +112,7 @@ void write_channels(const RecordLayout& layout, const Projection& p, int lane, c
 
 }  // namespace
 
-void project_surfels(const RasterCamera& camera, const SurfelArrays& in, const ProjectedSurfels& out, int threads) {
+void project_surfels(const RasterCamera& camera, const GaussianArrays& in, const ProjectedGaussians& out, int threads) {
   const RecordLayout layout = out.layout;
   const int64_t groups = (in.count + kLanes - 1) / kLanes;
 #pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1)
@@ -151,10 +127,10 @@ void project_surfels(const RasterCamera& camera, const SurfelArrays& in, const P
       const int64_t id = first + lane;
       const float* features = in.features + id * in.channels;
       if (!(p.visible >> lane & 1) || !all_finite(features, in.channels)) {
-        out.rects[id] = {0, 0, -1, -1};
+        out.rects[id] = kNoTiles;
         continue;
       }
-      out.rects[id] = {int16_t(p.x0[lane]), int16_t(p.y0[lane]), int16_t(p.x1[lane]), int16_t(p.y1[lane])};
+      out.rects[id] = p.tiles.rect(lane);
       out.depths[id] = p.depth[lane];
       float* record = out.records + id * layout.record_stride;
       for (int k = 0; k < kChannels; ++k) record[k] = fields[k][lane];

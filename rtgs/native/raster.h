@@ -1,4 +1,5 @@
-// The surfel rasteriser (docs/rasterizer.md): what its kernels share with their binding. Plain structs, no ownership.
+// The rasterisers (docs/rasterizer.md): what the kernels of surfels and ellipsoids share with their bindings. Plain structs,
+// no ownership. "Gaussian" is either kind.
 #pragma once
 #include <cstdint>
 
@@ -21,48 +22,32 @@ struct RasterCamera {
   int64_t pixels() const { return int64_t(width) * height; }
 };
 
-struct SurfelArrays {  // N rows each, contiguous, world frame
+struct GaussianArrays {  // N rows each, contiguous, world frame
   int64_t count;
   int channels;
-  const float *means, *tangent_u, *tangent_v, *scales, *opacities, *features;
+  const float *means, *tangent_u, *tangent_v, *scales, *opacities, *features;  // 2 scales (surfels) or 3 (ellipsoids)
 };
 
-// One record per surfel: what a pixel needs, in the order of use. Relative to the projected centre, d = pixel - mean:
-// (u, v) = (ux dx + uy dy, vx dx + vy dy) / D with D = dx_ dx + dy_ dy + d0, all seven divided by one positive number.
-enum RecordField : int {
-  kMeanX, kMeanY, kUx, kUy, kVx, kVy, kDx, kDy, kD0,
-  kLogOpacity,   // log2
-  kMinInverse,   // the plane's hit counts where 1/D >= this (in front of the camera, not before `near`)
-  kBoundX, kBoundY, kSlopeY, kSlopeX, kInvX2, kInvY2GivenX, kInvY2, kInvX2GivenY,  // bound ellipse, see raster_block.h
-  kDisc2,        // squared radius of the low-pass disc
-  kChannels,     // features, then the normal (3), then zeros up to the padded count, then kDepthFields floats
-};
-constexpr int kDepthFields = 2;  // z d0 (the hit's depth is z d0 / D), z of the centre
+// A bound ellipse in conditional form, as it stands in a record: y's mean given x is slope_y x with variance
+// 1 / inv_y2_given_x, and so on; every variance is that of the bound, so that the ellipse is where the quadratic is 1.
+enum BoundField : int { kSlopeY, kSlopeX, kInvX2, kInvY2GivenX, kInvY2, kInvX2GivenY, kBoundFields };
 
-// Sums over the pixels of one surfel, before the chain rule of the projection.
-enum GradientField : int {
-  kGradLogAlpha,
-  kGradU, kGradV, kGradD,                                      // to the numerators u, v (negated) and to D
-  kGradUx, kGradUy, kGradVx, kGradVy, kGradDx, kGradDy,
-  kGradDiscX, kGradDiscY,
-  kGradChannels,  // then, at kGradChannels + padded_channels: sum of g_z / D over plane hits; of g_z over disc hits
-};
-
-struct TileRect {  // tiles the surfel may touch, inclusive; x1 < x0: none
+struct TileRect {  // tiles the Gaussian may touch, inclusive; x1 < x0: none
   int16_t x0, y0, x1, y1;
   int64_t tiles() const { return x1 < x0 ? 0 : int64_t(x1 - x0 + 1) * (y1 - y0 + 1); }
 };
 
 struct RecordLayout {
-  int channels;         // composited per surfel: features and, if asked for, the normal
+  int channels;         // composited per Gaussian: features and, if asked for, the surfels' normal or the ellipsoids' depth
   int padded_channels;  // the kernel's compile-time count
   int record_stride;    // floats, whole cache lines
-  int gradient_stride;  // likewise; the first gradient_sums() are in use
-  bool normal, depth;   // normal among the channels; depth fields in the record and in the gradient row
-  int gradient_sums() const { return kGradChannels + padded_channels + (depth ? 2 : 0); }
+  int gradient_sums;    // floats of a gradient row that are in use
+  int gradient_stride;  // whole cache lines
+  bool normal, depth;   // surfels: normal among the channels, depth fields in record and gradient row; ellipsoids: depth
+                        // among the channels
 };
 
-struct ProjectedSurfels {
+struct ProjectedGaussians {
   RecordLayout layout;
   float* records;
   TileRect* rects;
@@ -73,39 +58,42 @@ struct DepthKey {
   uint32_t depth, id;
 };
 
-struct TileLists {  // an entry is one (surfel, tile) pair
+struct TileLists {  // an entry is one (Gaussian, tile) pair
   int64_t* starts;   // (tiles + 1) first entry of each tile
-  int32_t* ids;      // surfel of each entry, front to back
-  uint64_t* masks;   // blocks of the tile where the surfel shows, written by the forward pass
+  int32_t* ids;      // Gaussian of each entry, front to back
+  uint64_t* masks;   // blocks of the tile where it shows, written by the forward pass
   int64_t* used;     // (tiles) entries read before every pixel of the tile had stopped
   int64_t* work;     // (tiles) a measure of the backward pass's work
 };
 
 struct ForwardArgs {
   RasterCamera camera;
-  ProjectedSurfels surfels;
+  ProjectedGaussians gaussians;
   TileLists tiles;
-  int features;             // channels that are features; the rest of layout.channels is the normal
+  int features;             // channels that are features
   const float* background;  // (features) or null
-  float *feature_image, *normal_image;  // (features, H, W), (3, H, W)
-  float *alpha, *transmittance;         // (H, W)
-  // optional, null when not asked for:
+  float *feature_image, *extra_image;  // (features, H, W); the other channels (layout.channels - features, H, W)
+  float *alpha, *transmittance;        // (H, W)
+  float* entry_weights;     // (entries) sum of w; null when not asked for
+  // surfels only, null when not asked for:
   float *depth, *median_depth, *distortion, *first_inverse, *moment1, *moment2;  // (H, W)
   int32_t* median_entry;                                         // (H, W) entry within the tile, -1 where none
-  float* entry_weights;     // (entries) sum of w
+  // ellipsoids only:
+  float largest_fall;       // kHalfLog2E radius^2: how far the exponent may fall below its value at the centre
   int threads;
   float* plane(int channel) const {
     return channel < features ? feature_image + channel * camera.pixels()
-                              : normal_image + (channel - features) * camera.pixels();
+                              : extra_image + (channel - features) * camera.pixels();
   }
 };
 
 struct BackwardArgs {
   ForwardArgs forward;
   // upstream gradients; null: none
-  const float *grad_features, *grad_normal, *grad_alpha, *grad_depth, *grad_median, *grad_distortion;
-  float* rows;              // one gradient row per surfel, zero before the call
-  // Several threads: thread k takes the tiles from range_starts[k] to range_starts[k + 1]. A surfel's row belongs to
+  const float *grad_features, *grad_extra, *grad_alpha;
+  const float *grad_depth, *grad_median, *grad_distortion;  // surfels only
+  float* rows;              // one gradient row per Gaussian, zero before the call
+  // Several threads: thread k takes the tiles from range_starts[k] to range_starts[k + 1]. A Gaussian's row belongs to
   // the range of its first tile; what later ranges have for it waits in the order of tiles and is added at the end.
   // So every row is summed in the order of tiles, whatever the number of threads.
   int64_t* range_starts;    // (threads + 1)
@@ -115,21 +103,21 @@ struct BackwardArgs {
   int* poisoned;            // set to 1 when an upstream gradient is NaN or infinite
   const float* upstream(int channel) const {
     const int feature_count = forward.features;
-    const float* image = channel < feature_count ? grad_features : grad_normal;
+    const float* image = channel < feature_count ? grad_features : grad_extra;
     return image ? image + (channel < feature_count ? channel : channel - feature_count) * forward.camera.pixels() : nullptr;
   }
 };
 
-struct SurfelGradients {  // null: not wanted
+struct GaussianGradients {  // null: not wanted
   float *means, *tangent_u, *tangent_v, *scales, *opacities, *features, *screen_probe;
 };
 
 struct ProjectBackwardArgs {
   RasterCamera camera;
-  SurfelArrays inputs;
-  ProjectedSurfels surfels;
+  GaussianArrays inputs;
+  ProjectedGaussians gaussians;
   float* rows;  // zero again after the call
-  SurfelGradients out;
+  GaussianGradients out;
   bool saturate;  // a gradient that overflows becomes the largest float; off, so that NaN passes, when upstream holds one
   int threads;
 };
@@ -137,18 +125,16 @@ struct ProjectBackwardArgs {
 #define RTGS_RASTER_KERNELS(isa)                                                                                       \
   namespace isa {                                                                                                      \
   int padded_channels(int channels);                                                                                   \
-  void project_surfels(const RasterCamera&, const SurfelArrays&, const ProjectedSurfels&, int threads);                \
-  int64_t sort_by_depth(const ProjectedSurfels&, int64_t count, DepthKey* keys, DepthKey* spare,                      \
+  int64_t sort_by_depth(const ProjectedGaussians&, int64_t count, DepthKey* keys, DepthKey* spare,                    \
                         int64_t* scratch, int threads);                                                                \
   int64_t sort_scratch();                                                                                              \
-  int64_t count_tiles(const RasterCamera&, const ProjectedSurfels&, const DepthKey* order, int64_t visible,            \
+  int64_t count_tiles(const RasterCamera&, const ProjectedGaussians&, const DepthKey* order, int64_t visible,          \
                       int64_t* cursors, int64_t* starts, int threads);                                                 \
-  void fill_tiles(const RasterCamera&, const ProjectedSurfels&, const DepthKey* order, int64_t visible,                \
+  void fill_tiles(const RasterCamera&, const ProjectedGaussians&, const DepthKey* order, int64_t visible,              \
                   int64_t* cursors, int32_t* ids, int threads);                                                        \
-  void raster_forward(const ForwardArgs&);                                                                             \
   void sum_entry_weights(const ForwardArgs&, int64_t count, float* weight_sum);                                        \
-  void raster_backward(const BackwardArgs&, int64_t count);                                                            \
-  void project_backward(const ProjectBackwardArgs&);                                                                   \
+  void split_work(const BackwardArgs&);                                                                                \
+  void add_waiting(const BackwardArgs&, int64_t count);                                                                \
   }
 RTGS_RASTER_KERNELS(portable)
 #if defined(__x86_64__)

@@ -1,4 +1,4 @@
-// One 16x16 tile as blocks of kLanes pixels (4 wide), and a surfel's response in one block.
+// One 16x16 tile as blocks of kLanes pixels (4 wide): what every footprint shares.
 #pragma once
 #include "raster.h"
 #include "simd.h"
@@ -36,57 +36,37 @@ static inline vmask inside_image(const LaneOffsets& offsets, const RasterCamera&
   return gt(broadcast(float(camera.width)), offsets.x + x) & gt(broadcast(float(camera.height)), offsets.y + y);
 }
 
-// Which blocks of the tile meet the surfel's bound ellipse or its low-pass disc; lanes are blocks. The smallest value
-// of a convex quadratic over a rectangle lies at the centre, or on the edge line nearest to it in x or in y.
-static inline uint64_t touched_blocks(const float* record, const Tile& tile) {
-  const vfloat zero = broadcast(0.f);
-  const float reach_x = kBlockWidth - 1.f, reach_y = kBlockHeight - 1.f;
-  uint64_t touched = 0;
-#pragma GCC unroll 16
-  for (int group = 0; group < kBlocks; group += kLanes) {
-    vfloat corner_x, corner_y;
-    for (int lane = 0; lane < kLanes; ++lane) {
-      corner_x[lane] = block_x(group + lane) + 0.5f;
-      corner_y[lane] = block_y(group + lane) + 0.5f;
-    }
-    vfloat px = corner_x + tile.x, py = corner_y + tile.y;
-    vfloat x0 = px - record[kBoundX], y0 = py - record[kBoundY], x1 = x0 + reach_x, y1 = y0 + reach_y;
-    vfloat x = min(max(zero, x0), x1), y = min(max(zero, y0), y1);
-    vfloat best_y = record[kSlopeY] * x, best_x = record[kSlopeX] * y;
-    vfloat miss_y = min(max(best_y, y0), y1) - best_y, miss_x = min(max(best_x, x0), x1) - best_x;
-    vfloat at_x = record[kInvX2] * x * x + record[kInvY2GivenX] * miss_y * miss_y;
-    vfloat at_y = record[kInvY2] * y * y + record[kInvX2GivenY] * miss_x * miss_x;
-    vfloat dx = px - record[kMeanX], dy = py - record[kMeanY];
-    dx = min(max(zero, dx), dx + reach_x);
-    dy = min(max(zero, dy), dy + reach_y);
-    vmask hit = ge(broadcast(1.f), min(at_x, at_y)) | ge(broadcast(record[kDisc2]), dx * dx + dy * dy);
-    touched |= uint64_t(mask_bits(hit)) << group;
-  }
-  return touched;
-}
+constexpr float kBlockReachX = kBlockWidth - 1.f, kBlockReachY = kBlockHeight - 1.f;  // between outer pixel centres
 
-struct Response {
-  vfloat dx, dy, inverse, u, v, rho, exponent;  // inverse = 1/D; u, v in standard deviations; alpha_raw = 2^exponent
-  vmask plane;                                  // the plane branch; elsewhere inverse, u, v are finite, no more
+// Pixel centres of the first pixels of the blocks `group` to `group` + kLanes; lanes are blocks.
+struct BlockCorners {
+  vfloat x, y;
+  BlockCorners(const Tile& tile, int group) {
+    for (int lane = 0; lane < kLanes; ++lane) {
+      x[lane] = block_x(group + lane) + 0.5f;
+      y[lane] = block_y(group + lane) + 0.5f;
+    }
+    x = x + tile.x;
+    y = y + tile.y;
+  }
 };
 
-static inline Response respond(const float* record, vfloat x, vfloat y) {
-  Response r;
-  r.dx = x - record[kMeanX];
-  r.dy = y - record[kMeanY];
-  vfloat d = record[kDx] * r.dx + (record[kDy] * r.dy + record[kD0]);
-  r.inverse = reciprocal(max(d, broadcast(1e-18f)));  // D <= 0 never counts: rho_plane overflows, the disc wins
-  r.u = (record[kUx] * r.dx + record[kUy] * r.dy) * r.inverse;
-  r.v = (record[kVx] * r.dx + record[kVy] * r.dy) * r.inverse;
-  vfloat rho_plane = r.u * r.u + r.v * r.v, rho_disc = 2.f * (r.dx * r.dx + r.dy * r.dy);
-  r.plane = lt(rho_plane, rho_disc) & ge(r.inverse, broadcast(record[kMinInverse]));
-  r.rho = select(r.plane, rho_plane, rho_disc);
-  r.exponent = record[kLogOpacity] - kHalfLog2E * r.rho;
-  return r;
+// The quadratic's smallest value over each block whose first pixel lies at (x0, y0) from the ellipse's centre. Of a
+// convex quadratic over a rectangle it lies at the centre, or on the edge line nearest to it in x or in y.
+static inline vfloat least_in_block(const float* bound, vfloat x0, vfloat y0) {
+  const vfloat zero = broadcast(0.f);
+  vfloat x1 = x0 + kBlockReachX, y1 = y0 + kBlockReachY;
+  vfloat x = min(max(zero, x0), x1), y = min(max(zero, y0), y1);
+  vfloat best_y = bound[kSlopeY] * x, best_x = bound[kSlopeX] * y;
+  vfloat miss_y = min(max(best_y, y0), y1) - best_y, miss_x = min(max(best_x, x0), x1) - best_x;
+  vfloat at_x = bound[kInvX2] * x * x + bound[kInvY2GivenX] * miss_y * miss_y;
+  vfloat at_y = bound[kInvY2] * y * y + bound[kInvX2GivenY] * miss_x * miss_x;
+  return min(at_x, at_y);
 }
 
-static inline vmask shows(const Response& r, vfloat transmittance) {
-  return ge(r.exponent, broadcast(kLog2MinAlpha)) & ge(transmittance, broadcast(kMinTransmittance));
+// Lanes whose exponent is not cut and whose pixel has not stopped.
+static inline vmask shows(vfloat exponent, vfloat least_exponent, vfloat transmittance) {
+  return ge(exponent, least_exponent) & ge(transmittance, broadcast(kMinTransmittance));
 }
 
 template <int kFloats, int kWrite = 0>
@@ -129,6 +109,7 @@ template <template <int> class Kernel, class Args>
 static inline void for_channels(int padded, const Args& args) {
   switch (padded) {
     case 3: return Kernel<3>::run(args);
+    case 4: return Kernel<4>::run(args);
     case 6: return Kernel<6>::run(args);
     case 9: return Kernel<9>::run(args);
     case 12: return Kernel<12>::run(args);

@@ -54,11 +54,10 @@ def ellipsoid_discontinuity_mask(
         options.near - rounding,
         opacity_cut=ALPHA_CUT - bands.alpha,
     )
-    rows = (local, tangent_u, tangent_v, scales, opacities, features)
-    ellipsoids = project(*rows, camera, keep, options)
+    ellipsoids = project(local, tangent_u, tangent_v, scales, opacities, features, camera, keep, options)
     rounding = rounding[keep]
     fragile = (ellipsoids.depth - options.near).abs() <= rounding
-    fragile |= gradient_kinks(*(t[keep] for t in rows[:4]), camera, options)
+    fragile |= gradient_kinks(local[keep], tangent_u[keep], tangent_v[keep], scales[keep], camera, options)
     flags = []
     for chunk in pixel_chunks(pixel_centers(camera, means), len(keep)):
         decisions = decide(ellipsoids, chunk, options)
