@@ -14,6 +14,7 @@ using Ints = nb::ndarray<int32_t, nb::c_contig, nb::device::cpu>;
 
 void bind_isa(nb::module_& m);
 void bind_raster(nb::module_& m);
+void bind_ellipsoids(nb::module_& m);
 void bind_image(nb::module_& m);
 void bind_optimizer(nb::module_& m);
 void bind_surfels(nb::module_& m);

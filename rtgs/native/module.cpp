@@ -9,5 +9,6 @@ NB_MODULE(_core, m) {
   rtgs::bind_surfels(m);
   rtgs::bind_optimizer(m);
   rtgs::bind_raster(m);
+  rtgs::bind_ellipsoids(m);
   rtgs::bind_trace(m);
 }

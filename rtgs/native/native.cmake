@@ -11,6 +11,9 @@ set(RTGS_KERNELS
   raster_bins.cpp
   raster_forward.cpp
   raster_backward.cpp
+  ellipsoid_project.cpp
+  ellipsoid_project_backward.cpp
+  ellipsoid_tiles.cpp
   bvh_boxes.cpp
   trace_records.cpp
   trace_forward.cpp
@@ -23,6 +26,7 @@ set(RTGS_BINDINGS
   bind_surfels.cpp
   bind_optimizer.cpp
   bind_raster.cpp
+  bind_ellipsoids.cpp
   bvh_tree.cpp
   bind_trace.cpp)
 

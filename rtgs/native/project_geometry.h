@@ -23,14 +23,14 @@ static inline vfloat normal_sign(const SurfelGeometry& g) {
 static inline SurfelGeometry surfel_geometry(const RasterCamera& camera, const GaussianArrays& in, int64_t first) {
   SurfelGeometry g;
   RowReader rows(first, in.count);
-  const vec3 mean = rows.vector(in.means);
-  g.tangent_u = rows.vector(in.tangent_u);
-  g.tangent_v = rows.vector(in.tangent_v);
+  const vec3 mean = rows.vector(in.means, first);
+  g.tangent_u = rows.vector(in.tangent_u, first);
+  g.tangent_v = rows.vector(in.tangent_v, first);
   vfloat scales[2];
-  rows.read(in.scales, scales);
+  rows.components(in.scales, first, scales);
   g.scale_u = scales[0];
   g.scale_v = scales[1];
-  g.opacity = rows.scalar(in.opacities);
+  g.opacity = rows.component(in.opacities, 1, first, 0);
   g.finite_inputs = finite(g.opacity) & finite(g.scale_u) & finite(g.scale_v) & finite(mean) & finite(g.tangent_u) &
                     finite(g.tangent_v);
 

@@ -26,32 +26,26 @@ static inline vec3 rotate_back(const float* r, vec3 a) {  // R^T a
 }
 
 // ---- rows in ---------------------------------------------------------------------------------------------------
-// kLanes rows of W components, from row `first`; lanes past the last row repeat it.
-class RowReader {
- public:
-  RowReader(int64_t first, int64_t count) : first_(first), full_(first + kLanes <= count) {
-    for (int lane = 0; lane < kLanes; ++lane) row_[lane] = first + lane < count ? lane : int32_t(count - 1 - first);
+// kLanes rows of width components, from row `first`; lanes past the last row repeat it.
+struct RowReader {
+  vint row;
+  bool full;  // no lane is past the last row
+  RowReader(int64_t first, int64_t count) : full(first + kLanes <= count) {
+    for (int lane = 0; lane < kLanes; ++lane) row[lane] = first + lane < count ? lane : int32_t(count - 1 - first);
+  }
+  vfloat component(const float* base, int width, int64_t first, int index) const {
+    return gather(base + first * width + index, row * width);
   }
   template <int W>
-  void read(const float* base, vfloat (&out)[W]) const {
-    if (full_) return load_rows<W>(base + first_ * W, out);
-    for (int k = 0; k < W; ++k) out[k] = gather(base + first_ * W + k, row_ * W);
+  void components(const float* base, int64_t first, vfloat (&out)[W]) const {
+    if (full) return load_rows<W>(base + first * W, out);
+    for (int k = 0; k < W; ++k) out[k] = component(base, W, first, k);
   }
-  vec3 vector(const float* base) const {
+  vec3 vector(const float* base, int64_t first) const {
     vfloat v[3];
-    read(base, v);
+    components(base, first, v);
     return {v[0], v[1], v[2]};
   }
-  vfloat scalar(const float* base) const {
-    vfloat v[1];
-    read(base, v);
-    return v[0];
-  }
-
- private:
-  int64_t first_;
-  bool full_;
-  vint row_;
 };
 
 static inline bool all_finite(const float* values, int count) {

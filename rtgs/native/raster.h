@@ -27,6 +27,7 @@ struct GaussianArrays {  // N rows each, contiguous, world frame
   int channels;
   const float *means, *tangent_u, *tangent_v, *scales, *opacities, *features;  // 2 scales (surfels) or 3 (ellipsoids)
 };
+using SurfelArrays = GaussianArrays;
 
 // A bound ellipse in conditional form, as it stands in a record: y's mean given x is slope_y x with variance
 // 1 / inv_y2_given_x, and so on; every variance is that of the bound, so that the ellipse is where the quadratic is 1.

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor
 
+from rtgs.cameras import Camera
 from rtgs.gaussians.harmonics import MAX_DEGREE, rest_count
 from rtgs.render.buffers import TraceOptions
 
 MAX_CHANNELS = 32
+MAX_SIDE = 1 << 18  # pixels: the kernels' tile numbers are 16-bit
 
 
 def check_shapes(
@@ -90,10 +94,10 @@ def check_tree_shapes(surfels: dict[str, Tensor], alpha_cutoff: float) -> None:
         raise ValueError(f"alpha_cutoff={alpha_cutoff} must be in (0, 0.99): it bounds a surfel's support")
 
 
-def check_float32(tensors: dict[str, Tensor], twin: str) -> None:
+def check_float32(tensors: Mapping[str, Tensor | None], twin: str) -> None:
     """Raise ValueError, naming the tensor, when one is not float32 on the CPU; ``twin``: the module that takes any."""
     for name, tensor in tensors.items():
-        if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
+        if tensor is not None and (tensor.dtype != torch.float32 or tensor.device.type != "cpu"):
             raise ValueError(
                 f"{name} must be float32 on the CPU, got {tensor.dtype} on {tensor.device}; convert it, or use {twin} "
                 "for float64"
@@ -121,3 +125,9 @@ def _check_shape(name: str, tensor: Tensor, shape: tuple[int, ...]) -> None:
 
 def _rows(tensor: Tensor) -> int:
     return tensor.shape[0] if tensor.ndim else 0
+
+
+def check_size(camera: Camera) -> None:
+    """Raise ValueError when the image is larger than the native core counts."""
+    if max(camera.width, camera.height) > MAX_SIDE:
+        raise ValueError(f"image of {camera.width}x{camera.height}: sides above {MAX_SIDE} pixels are not supported")

@@ -10,10 +10,10 @@ from torch.autograd.function import once_differentiable
 
 from rtgs.cameras import Camera
 from rtgs.native import core
-from rtgs.render.arguments import check_shapes
+from rtgs.render.arguments import check_float32, check_shapes, check_size
 from rtgs.render.buffers import RasterBuffers, RasterOptions
+from rtgs.render.native_call import as_array, empty_if, native_camera
 
-MAX_SIDE = 1 << 18  # tile numbers are 16-bit
 _DEFAULT_OPTIONS = RasterOptions()
 
 
@@ -50,16 +50,9 @@ def rasterize_surfels(
         ValueError: a shape, a dtype or an option does not fit; the message names the argument.
     """
     check_shapes(means, tangent_u, tangent_v, scales, opacities, features, background, screen_probe)
-    _check_dtypes(
-        means=means,
-        tangent_u=tangent_u,
-        tangent_v=tangent_v,
-        scales=scales,
-        opacities=opacities,
-        features=features,
-        background=background,
-        screen_probe=screen_probe,
-    )
+    named = {"means": means, "tangent_u": tangent_u, "tangent_v": tangent_v, "scales": scales, "opacities": opacities}
+    named |= {"features": features, "background": background, "screen_probe": screen_probe}
+    check_float32(named, "rtgs.render.reference")
     _check_options(options, camera)
     if background is not None:
         background = background.detach().contiguous()
@@ -84,19 +77,6 @@ class _Call:
     background: Tensor | None
     threads: int
 
-    def native_camera(self) -> core.RasterCamera:
-        c, o = self.camera, self.options
-        rotation, translation = c.rotation.contiguous().numpy(), c.translation.contiguous().numpy()
-        return core.RasterCamera(rotation, translation, c.fx, c.fy, c.cx, c.cy, c.width, c.height, o.near, o.far)
-
-
-def _array(tensor: Tensor | None):
-    return None if tensor is None else tensor.detach().numpy()
-
-
-def _empty(wanted: bool, *shape: int) -> Tensor | None:
-    return torch.empty(shape, dtype=torch.float32) if wanted else None
-
 
 class _Rasterize(torch.autograd.Function):
     """Memory of the forward pass lives in ``ctx.native`` and returns to a pool when autograd drops the context."""
@@ -104,27 +84,27 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means, tangent_u, tangent_v, scales, opacities, features, screen_probe, call: _Call):
         options, width, height = call.options, call.camera.width, call.camera.height
-        arrays = [_array(t) for t in (means, tangent_u, tangent_v, scales, opacities, features)]
+        arrays = [as_array(t) for t in (means, tangent_u, tangent_v, scales, opacities, features)]
         needs_depth = options.depth or options.median_depth or options.distortion
-        native = core.Rasterization(call.native_camera(), options.normal, needs_depth)
+        native = core.Rasterization(native_camera(call.camera, options.near, options.far), options.normal, needs_depth)
         native.project(*arrays, call.threads)
 
         image = torch.empty(features.shape[1], height, width, dtype=torch.float32)
         alpha = torch.empty(height, width, dtype=torch.float32)
-        depth = _empty(options.depth, height, width)
-        median_depth = _empty(options.median_depth, height, width)
-        normal = _empty(options.normal, 3, height, width)
-        distortion = _empty(options.distortion, height, width)
-        weight_sum = _empty(options.weight_sum, means.shape[0])
+        depth = empty_if(options.depth, height, width)
+        median_depth = empty_if(options.median_depth, height, width)
+        normal = empty_if(options.normal, 3, height, width)
+        distortion = empty_if(options.distortion, height, width)
+        weight_sum = empty_if(options.weight_sum, means.shape[0])
         native.forward(
-            _array(call.background),
-            _array(image),
-            _array(normal),
-            _array(alpha),
-            _array(depth),
-            _array(median_depth),
-            _array(distortion),
-            _array(weight_sum),
+            as_array(call.background),
+            as_array(image),
+            as_array(normal),
+            as_array(alpha),
+            as_array(depth),
+            as_array(median_depth),
+            as_array(distortion),
+            as_array(weight_sum),
         )
         if any(ctx.needs_input_grad):
             ctx.native = native
@@ -145,30 +125,20 @@ class _Rasterize(torch.autograd.Function):
             return (None,) * 8
         means = inputs[0]
         like = [*inputs, means[:, :2]]
-        gradients = [_empty(needed, *t.shape) for t, needed in zip(like, ctx.needs_input_grad, strict=False)]
+        gradients = [empty_if(needed, *t.shape) for t, needed in zip(like, ctx.needs_input_grad, strict=False)]
         ctx.native.backward(
-            *(_array(t) for t in inputs),
-            _array(image),
-            _array(normal),
-            _array(depth),
-            _array(distortion),
-            *(None if g is None else _array(g.contiguous()) for g in upstream),
-            *(_array(g) for g in gradients),
+            *(as_array(t) for t in inputs),
+            as_array(image),
+            as_array(normal),
+            as_array(depth),
+            as_array(distortion),
+            *(None if g is None else as_array(g.contiguous()) for g in upstream),
+            *(as_array(g) for g in gradients),
         )
         return (*gradients, None)
-
-
-def _check_dtypes(**tensors: Tensor | None) -> None:
-    for name, tensor in tensors.items():
-        if tensor is not None and (tensor.dtype != torch.float32 or tensor.device.type != "cpu"):
-            raise ValueError(
-                f"{name} must be float32 on the CPU, got {tensor.dtype} on {tensor.device}; "
-                "convert it, or use rtgs.render.reference for float64"
-            )
 
 
 def _check_options(options: RasterOptions, camera: Camera) -> None:
     if not 0 < options.near < options.far:
         raise ValueError(f"near={options.near} and far={options.far} must satisfy 0 < near < far (world units)")
-    if max(camera.width, camera.height) > MAX_SIDE:
-        raise ValueError(f"image of {camera.width}x{camera.height}: sides above {MAX_SIDE} pixels are not supported")
+    check_size(camera)
