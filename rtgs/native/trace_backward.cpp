@@ -360,7 +360,8 @@ void PacketBackward::write_rays() {
   }
   for (int k = 0; k < 3; ++k) {
     if (args_.out_origins) scatter(args_.out_origins + k, rays_.ray * 3, to_origin_[k], rays_.exists);
-    if (args_.out_directions) scatter(args_.out_directions + k, rays_.ray * 3, to_direction_[k], rays_.exists);
+    const vfloat direction = where(rays_.usable, to_direction_[k]);  // an infinite one has no unit vector
+    if (args_.out_directions) scatter(args_.out_directions + k, rays_.ray * 3, direction, rays_.exists);
   }
 }
 

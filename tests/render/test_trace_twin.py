@@ -49,7 +49,7 @@ def test_ordinary_scenes(isa: str):
 
 @pytest.mark.parametrize("kind", [GRAZING, *DEGENERATE])
 def test_degenerate_scenes(isa: str, kind: str):
-    pools, twin = pool_examples(kind, 12, with_twin=True)
+    pools, twin = pool_examples(kind, 24, with_twin=True)
     assert pools.flagged_share < 0.5
     for name, pool in pools.outputs.items():
         allowed = max(RAY_SHARE, SLACK * twin.outputs[name].share_beyond(RAY_TOLERANCE))
