@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 
-from pipelines import evaluate, extract_mesh, import_scene, render, report, train_diffuse
+from pipelines import evaluate, extract_mesh, import_scene, render, report, synthesize, train_diffuse
 from pipelines.training import StageParams
 from rtgs.config.schema import Choices, RunConfig
 from rtgs.methods import method_stages
@@ -26,6 +26,7 @@ KINDS: tuple[StepKind, ...] = (
     render.STEP,
     evaluate.STEP,
     report.STEP,
+    synthesize.STEP,
 )
 """Every kind of step there is; the guard against forgotten version bumps goes through them."""
 
