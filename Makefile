@@ -23,7 +23,7 @@ $(READY): $(NATIVE)
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install -q --upgrade pip
 	$(BIN)/pip install -q "$(TORCH)"
-	$(BIN)/pip install -q -e '.[dev,synthetic]'
+	$(BIN)/pip install -q -e '.[dev,prepare,synthetic]'
 	@touch $(READY)
 
 demo: setup ## train the embedded glass scene, end with a page of pictures and numbers (under 5 minutes)

@@ -18,7 +18,6 @@ from rtgs.errors import RtgsError
 USAGE = f"""rtgs {__version__}: Gaussian models of scenes with glass and mirrors, on the CPU
 
   rtgs run [group=choice] [key=value]     train, render, measure, report; what is cached is not run again
-  rtgs run synthesize scene=NAME|all      path-trace a described scene into a capture with known truth
   rtgs plan [group=choice] [key=value]    what `rtgs run` with the same words would do, and why
   rtgs check FOLDER | scene=NAME          what is wrong with a capture, before any training
   rtgs report [RUN]                       where the report of the latest (or the named) run is
@@ -111,11 +110,6 @@ def _raised_in_project(trace: TracebackType | None) -> bool:
 
 def run(words: list[str]) -> int:
     """``rtgs run``: everything after it goes to Hydra."""
-    if words[:1] == ["synthesize"]:
-        from pipelines.synthesize import run_synthesize
-
-        run_synthesize(words[1:])
-        return 0
     from pipelines.app import run_hydra
 
     run_hydra(words)
@@ -135,8 +129,9 @@ def plan(words: list[str]) -> int:
     from rtgs.pipeline import Store, make_plan
 
     config, choices = compose(friendly_overrides(words))
-    planned = make_plan(build_graph(config, choices).targets, Store(config.paths.store), remote_store(config))
-    rows = [("step", "key", "state", "why"), *(tuple(row.values()) for row in plan_rows(planned))]
+    graph = build_graph(config, choices)
+    planned = make_plan(graph.targets, Store(config.paths.store), remote_store(config))
+    rows = [("step", "key", "state", "why"), *(tuple(row.values()) for row in plan_rows(planned, graph.skipped))]
     print(columns(rows))
     print(f"\n{describe(planned)}")
     return 0
@@ -157,11 +152,11 @@ def check(words: list[str]) -> int:
         return 0 if words else 2
     from pipelines.app import friendly_overrides
     from rtgs.config import compose
-    from rtgs.scenes.check import check_capture
+    from rtgs.prepare.source import check_source
 
     first = words[0] if "=" in words[0] else f"scene.path={words[0]}"
     config, _ = compose(friendly_overrides([first, *words[1:]]))
-    findings = check_capture(config.scene)
+    findings = check_source(config.scene, config.sfm)
     errors = sum(finding.severity == "error" for finding in findings)
     for finding in findings:
         print(f"{finding.severity}: {finding.message}")

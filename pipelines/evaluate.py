@@ -60,13 +60,7 @@ def evaluate(params: EvaluateParams, context: StepContext) -> None:
 
 STEP = StepKind(
     "evaluate",
-    2,
+    1,
     evaluate,
-    helpers=(
-        "rtgs.evaluate.evaluate",
-        "rtgs.evaluate.layers",
-        "rtgs.evaluate.metrics",
-        "rtgs.evaluate.lpips",
-        "rtgs.evaluate.images",
-    ),
+    helpers=("rtgs.evaluate.evaluate", "rtgs.evaluate.metrics", "rtgs.evaluate.lpips", "rtgs.evaluate.images"),
 )

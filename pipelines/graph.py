@@ -1,4 +1,4 @@
-"""The graph of a run: import -> one training step per stage (-> mesh) -> render -> evaluate -> report.
+"""The graph of a run: (sfm ->) import -> one training step per stage (-> mesh) -> render -> evaluate -> report.
 
 Pure: from a config to steps with parameters; nothing runs here. Each step is given only what it reads.
 """
@@ -8,7 +8,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 
-from pipelines import evaluate, extract_mesh, import_scene, render, report, synthesize, train_diffuse
+from pipelines import evaluate, extract_mesh, import_scene, render, report, sfm, train_diffuse
+from pipelines.preparation import SkippedStep, prepare
 from pipelines.training import StageParams
 from rtgs.config.schema import Choices, RunConfig
 from rtgs.methods import method_stages
@@ -20,13 +21,13 @@ TRAINING: Mapping[str, StepKind] = {"diffuse": train_diffuse.STEP}
 """The step that runs a stage, by the name the method gives it."""
 
 KINDS: tuple[StepKind, ...] = (
+    sfm.STEP,
     import_scene.STEP,
     *TRAINING.values(),
     extract_mesh.STEP,
     render.STEP,
     evaluate.STEP,
     report.STEP,
-    synthesize.STEP,
 )
 """Every kind of step there is; the guard against forgotten version bumps goes through them."""
 
@@ -43,6 +44,7 @@ class RunGraph:
     evaluate: Step
     report: Step
     mesh: Step | None = None
+    skipped: tuple[SkippedStep, ...] = ()
 
     @property
     def targets(self) -> tuple[Step, ...]:
@@ -57,7 +59,8 @@ def build_graph(config: RunConfig, choices: Choices) -> RunGraph:
         CaptureError: the capture cannot be read.
         ValueError: no method of this name.
     """
-    scene = import_scene.STEP.step(import_scene.import_params(config.scene))
+    prepared = prepare(config)
+    scene = prepared.scene
     training = _training(config, scene)
     rendered = render.STEP.step(render.RenderParams(), scene, *training)
     measured = evaluate.STEP.step(
@@ -69,8 +72,9 @@ def build_graph(config: RunConfig, choices: Choices) -> RunGraph:
     )
     mesh = extract_mesh.STEP.step(_mesh_params(config), scene, *training) if config.mesh.extract else None
     made = (rendered, measured) if mesh is None else (mesh, rendered, measured)
-    page = report.STEP.step(_report_params(config, choices), scene, *training, *made)
-    return RunGraph(scene, training, rendered, measured, page, mesh)
+    params = _report_params(config, choices, prepared.skipped)
+    page = report.STEP.step(params, *prepared.steps, scene, *training, *made)
+    return RunGraph(scene, training, rendered, measured, page, mesh, prepared.skipped)
 
 
 def _training(config: RunConfig, scene: Step) -> tuple[Step, ...]:
@@ -106,11 +110,12 @@ def method_label(choices: Choices) -> str:
     return choices.method if choices.ablation in ("", "none") else f"{choices.method}, {choices.ablation}"
 
 
-def _report_params(config: RunConfig, choices: Choices) -> report.ReportParams:
+def _report_params(config: RunConfig, choices: Choices, skipped: tuple[SkippedStep, ...]) -> report.ReportParams:
     values, defaults = shown_values(config), shown_values(RunConfig())
     lines = {key: (str(values[key]), str(defaults.get(key, ""))) for key in sorted(values)}
     title = f"{config.scene.name}: {method_label(choices)}, {choices.preset}"
-    return report.ReportParams(title, command(choices), lines)
+    decisions = tuple((f"no {step.name} step", step.why) for step in skipped)
+    return report.ReportParams(title, command(choices), lines, decisions)
 
 
 def shown_values(config: RunConfig) -> dict[str, object]:

@@ -85,8 +85,7 @@ def read_timed(folder: Path, view_name: str) -> TimedRender:
     from rtgs.evaluate.evaluate import TimedRender
 
     seconds = json.loads((folder / TIMES_FILE).read_text(encoding="utf-8"))["seconds"]
-    tensors = read_render(folder, view_name)
-    return TimedRender(tensors["image"], seconds[view_name], tensors.get("reflection"))
+    return TimedRender(read_render(folder, view_name)["image"], seconds[view_name])
 
 
 STEP = StepKind(

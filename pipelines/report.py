@@ -17,8 +17,6 @@ from rtgs.pipeline import StepContext, StepKind
 from rtgs.pipeline.manifest import Manifest
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from rtgs.evaluate.evaluate import EvaluationTable
     from rtgs.report.figures import Curve
     from rtgs.report.page import MeshFigure, ReportView, StepLine
@@ -34,6 +32,8 @@ class ReportParams:
     command: str
     config: dict[str, tuple[str, str]]
     """Value and default of every config key that has to do with the result."""
+    decisions: tuple[tuple[str, str], ...] = ()
+    """What the graph left out, and why."""
     views: int = 4
     """How many test views are shown: the best, the worst, and evenly between."""
 
@@ -49,7 +49,8 @@ def report(params: ReportParams, context: StepContext) -> None:
     summary = read_summary(training)
     manifest = Manifest.read(training)
     assert manifest is not None
-    decisions = [Decision(**item) for item in summary["decisions"]]  # pyright: ignore[reportGeneralTypeIssues]
+    decisions = [Decision(*item) for item in params.decisions]
+    decisions += [Decision(**item) for item in summary["decisions"]]  # pyright: ignore[reportGeneralTypeIssues]
     data = ReportData(
         title=params.title,
         evaluation=table,
@@ -79,19 +80,8 @@ def _views(table: EvaluationTable, inputs: Mapping[str, Path], count: int) -> tu
         maps = read_render(inputs["render"], name)
         photo = photos[name]
         shown = {key: maps.get(key) for key in ("depth", "normal", "alpha")}
-        truth = {"mask": photo.mask, "truth": photo.truth}
-        views.append(
-            ReportView(name, photo.camera, photo.image, maps["image"], role, layers=_layers(maps), **truth, **shown)
-        )
+        views.append(ReportView(name, photo.camera, photo.image, maps["image"], role, mask=photo.mask, **shown))
     return tuple(views)
-
-
-def _layers(maps: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The layers of a rendered view as the page takes them; none for methods without reflection."""
-    if "reflection" not in maps:
-        return {}
-    names = ("reflection", "normal", "specular", "roughness", "f0")
-    return {"diffuse": (1 - maps["specular"]) * maps["diffuse"]} | {name: maps[name] for name in names if name in maps}
 
 
 def _mesh(folder: Path) -> MeshFigure:
@@ -134,4 +124,4 @@ def _steps(context: StepContext) -> tuple[StepLine, ...]:
     return tuple(lines)
 
 
-STEP = StepKind("report", 2, report, helpers=("rtgs.report.page", "rtgs.report.figures", "rtgs.report.layers"))
+STEP = StepKind("report", 2, report, helpers=("rtgs.report.page", "rtgs.report.figures"))

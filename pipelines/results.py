@@ -20,10 +20,11 @@ from rtgs.config.schema import Choices, RunConfig
 from rtgs.errors import RtgsError
 from rtgs.pipeline import Plan, StepResult, Store
 from rtgs.pipeline.fingerprint import flatten
+from rtgs.prepare.quality import PICTURE_FILE, REPORT_FILE
 from rtgs.track import RunInfo, Tracker
-from rtgs.track.source import git_tags
 
 if TYPE_CHECKING:
+    from pipelines.preparation import SkippedStep
     from rtgs.evaluate.evaluate import EvaluationTable
 
 RUN_FILE = "run.json"
@@ -84,6 +85,8 @@ def _fill_run_folder(
         shutil.copyfile(ply, folder / ("point_cloud.ply" if ply.stem == "base" else ply.name))
     for mesh in sorted(places["extract_mesh"].glob("mesh.*")) if "extract_mesh" in places else ():
         shutil.copyfile(mesh, folder / mesh.name)
+    for name in (REPORT_FILE, PICTURE_FILE) if "sfm" in places else ():
+        shutil.copyfile(places["sfm"] / name, folder / name)
     (folder / "config.yaml").write_text(config_yaml(config), encoding="utf-8")
     finished = datetime.now(UTC).isoformat(timespec="seconds")
     record = RunRecord(str(config.name), command, finished, asdict(choices), steps)
@@ -153,13 +156,14 @@ def _figure(value: float | None, form: str) -> str:
     return "n/a" if value is None else form.format(value)
 
 
-def run_info(config: RunConfig, choices: Choices, plan: Plan, parent: str = "") -> RunInfo:
+def run_info(config: RunConfig, choices: Choices, plan: Plan) -> RunInfo:
     """How a run appears in the tracker: names as tags, each step linked by its fingerprint."""
     target = plan.steps[-1].step
     tags = {f"rtgs.{key}": getattr(choices, key) for key in ("scene", "method", "preset", "ablation", "experiment")}
     tags |= {f"rtgs.step.{planned.step.name}": planned.step.fingerprint for planned in plan}
-    tags |= {"rtgs.seed": str(config.seed), **git_tags()}
-    return RunInfo(config.tracking.experiment, str(config.name), target.fingerprint, tags, parent)
+    return RunInfo(
+        config.tracking.experiment, str(config.name), target.fingerprint, tags | {"rtgs.seed": str(config.seed)}
+    )
 
 
 def track_start(tracker: Tracker, config: RunConfig, plan: Plan) -> None:
@@ -202,9 +206,12 @@ def _track_png(tracker: Tracker, name: str, path: Path) -> None:
         tracker.image(name, np.asarray(Image.open(path).convert("RGB")))
 
 
-def plan_rows(plan: Plan) -> list[Mapping[str, str]]:
-    """One row per step of a plan."""
-    return [
+def plan_rows(plan: Plan, skipped: Sequence[SkippedStep] = ()) -> list[Mapping[str, str]]:
+    """One row per step of a plan, after those that are not needed."""
+    rows: list[Mapping[str, str]] = [
+        {"step": step.name, "key": "", "state": "skipped", "why": step.why} for step in skipped
+    ]
+    return rows + [
         {
             "step": planned.step.name,
             "key": planned.step.fingerprint[:12],

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from rtgs.mesh.tsdf import TsdfSettings
+from rtgs.prepare.settings import SfmSettings
 from rtgs.scenes.settings import SceneSettings
 from rtgs.train.settings import MethodSettings, ScheduleSettings
 
@@ -120,6 +121,7 @@ class RunConfig:
     """One run: a method trained on a scene with a budget, measured and reported."""
 
     scene: SceneSettings = field(default_factory=SceneSettings)
+    sfm: SfmSettings = field(default_factory=SfmSettings)
     method: MethodSettings = field(default_factory=MethodSettings)
     schedule: ScheduleSettings = field(default_factory=ScheduleSettings)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)

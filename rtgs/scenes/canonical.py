@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -165,11 +166,20 @@ def capture_digest(settings: SceneSettings) -> str:
             files |= set(truth_files(view.truth))
     if settings.split_file is not None:
         files.add(capture.root / settings.split_file)
-    digest = hashlib.sha256(f"{capture.format}\n".encode())
-    for name, path in sorted((Path(os.path.relpath(path, capture.root)).as_posix(), path) for path in files):
+    return files_digest(capture.format, capture.root, files)
+
+
+def files_digest(title: str, root: Path, files: Iterable[Path]) -> str:
+    """SHA-256 over ``title`` and the names (relative to ``root``), sizes and contents of files.
+
+    Raises:
+        CaptureError: a file cannot be read.
+    """
+    digest = hashlib.sha256(f"{title}\n".encode())
+    for name, path in sorted((Path(os.path.relpath(path, root)).as_posix(), path) for path in files):
         try:
             state = path.stat()
-            content = _content_hash(str(path), state.st_size, state.st_mtime_ns)
+            content = content_hash(str(path), state.st_size, state.st_mtime_ns)
         except OSError as error:
             raise CaptureError(f"{path} cannot be read ({error.strerror}): restore the file") from error
         digest.update(f"{name}\t{state.st_size}\t{content}\n".encode())
@@ -177,7 +187,7 @@ def capture_digest(settings: SceneSettings) -> str:
 
 
 @lru_cache(maxsize=65536)
-def _content_hash(path: str, size: int, mtime_ns: int) -> str:
-    """Hash of a file's content; size and time of change are the key under which this process remembers it."""
+def content_hash(path: str, size: int, mtime_ns: int) -> str:
+    """SHA-256 of a file's content; size and time of change are the key under which this process remembers it."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

@@ -39,21 +39,27 @@ def detect_format(root: Path, settings: SceneSettings) -> str:
     Raises:
         CaptureError: none of them.
     """
+    if found := find_format(root, settings):
+        return found
+    if partial := incomplete_model(root, settings.model_dir):
+        raise CaptureError(f"{partial}: copy the whole folder, or export the model again")
+    content = ", ".join(sorted(p.name for p in root.iterdir())[:10]) or "nothing"
+    raise CaptureError(
+        f"{root} is no capture: neither a COLMAP model (sparse/0/cameras.bin ...), transforms.json, nor "
+        f"transforms_train.json is there, but {content}; correct scene.path, let `rtgs run` look for poses "
+        "(sfm.use=auto), or run COLMAP on the photos first"
+    )
+
+
+def find_format(root: Path, settings: SceneSettings) -> str | None:
+    """The named format, or the first of colmap, transforms, blender whose files are there; None: no poses."""
     if settings.format != "auto":
         return settings.format
     if find_model(root, settings.model_dir) is not None:
         return "colmap"
     if is_transforms(root):
         return "transforms"
-    if is_blender(root):
-        return "blender"
-    if partial := incomplete_model(root, settings.model_dir):
-        raise CaptureError(f"{partial}: copy the whole folder, or export the model again")
-    content = ", ".join(sorted(p.name for p in root.iterdir())[:10]) or "nothing"
-    raise CaptureError(
-        f"{root} is no capture: neither a COLMAP model (sparse/0/cameras.bin ...), transforms.json, nor "
-        f"transforms_train.json is there, but {content}; correct scene.path, or run COLMAP on the photos first"
-    )
+    return "blender" if is_blender(root) else None
 
 
 def read_capture(settings: SceneSettings) -> Capture:

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks import gaussians, losses, raster, speed_error, train_step
+from benchmarks import gaussians, losses, raster, sfm, speed_error, train_step
 from rtgs.native import core
 
 
@@ -96,3 +96,10 @@ def test_speed_error_shrinks_the_schedule() -> None:
 
 def test_speed_error_sweep_has_each_point_once() -> None:
     assert sorted(speed_error.sweep([500, 1000], [5, 10])) == [(500, 10), (1000, 5), (1000, 10)]
+
+
+def test_sfm(run) -> None:
+    figures = run(sfm)
+    assert figures["rows"] == [], "without the photo sets there is nothing to compare with"
+    row = sfm.Row("fox", 5, 4, ("e.jpg",), 0.01, 0.02, 0.001, 0.002, 0.01, 0.5, 1.0, 2.0, 3.0, 900.0, 300.0)
+    assert "| fox | 4 of 5 (not e.jpg) | 0.010, max 0.020 | 1.00, max 2.00 | +1.00% |" in sfm.table([row])

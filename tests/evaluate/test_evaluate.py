@@ -38,7 +38,6 @@ class Photo:
     name: str
     image: torch.Tensor
     mask: torch.Tensor | None = None
-    truth: None = None
 
 
 @pytest.fixture(autouse=True)

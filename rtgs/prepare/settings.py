@@ -1,0 +1,182 @@
+"""What the preparation of a capture can be told: the schema of the ``sfm`` config group.
+
+Numbers without a source are COLMAP's defaults (``pycolmap.IncrementalPipelineOptions`` and its siblings print them).
+"""
+
+from __future__ import annotations
+
+import difflib
+from dataclasses import dataclass, field
+
+from rtgs.errors import RtgsError
+
+USE = ("auto", "always", "never")
+MATCHING = ("auto", "exhaustive", "sequential", "retrieval")
+MAPPERS = ("incremental", "global")
+FEATURES = ("sift", "aliked_n16rot", "aliked_n32")
+
+
+class PrepareError(RtgsError):
+    """Photos, a video or a model from which nothing can be prepared: what is wrong, the value, where, what to do."""
+
+
+@dataclass(frozen=True)
+class VideoSettings:
+    """How frames are taken out of a video."""
+
+    shift: float = 0.05
+    """Motion between two chosen frames, in long sides of the picture (median of tracked corners). 0.05 of 800 pixels
+    is 40: neighbours overlap by well over 80 %, which SIFT matching likes."""
+    min_frames: int = 20
+    """A slow video gives at least this many (or all it has)."""
+    max_frames: int = 150
+    """And never more; beyond it the frames lie farther apart."""
+    candidates_per_second: float = 8.0
+    """Frames that are looked at; of those between two choices the sharpest is taken."""
+    min_motion: float = 0.1
+    """A video whose whole motion is less, in long sides, is refused: no poses without parallax."""
+    max_side: int | None = None
+    """Long side of the written frames. None: the video's own."""
+    jpeg_quality: int = 95
+    """Of the written frames."""
+
+
+@dataclass(frozen=True)
+class FeatureSettings:
+    """Keypoints and descriptors."""
+
+    kind: str = "sift"
+    """``sift``; ``aliked_n16rot`` and ``aliked_n32`` need COLMAP's model files on this machine."""
+    max_side: int = 1600
+    """Photos are shrunk to it for the search (COLMAP's quality "medium"; 2400 is "high")."""
+    max_features: int = 8192
+    affine_shape: bool = False
+    """Estimate the affine shape of SIFT keypoints: more matches across wide angles, several times slower."""
+    peak_threshold: float = 0.0067
+    """Contrast below which a SIFT keypoint does not count; lower finds more on plain walls."""
+
+
+@dataclass(frozen=True)
+class MatchingSettings:
+    """Which photos are compared, and how strictly."""
+
+    pairs: str = "auto"
+    """``exhaustive`` every pair; ``sequential`` neighbours in order, for videos; ``retrieval`` the most similar ones.
+    ``auto``: exhaustive up to ``exhaustive_up_to`` photos, beyond it sequential for a video, retrieval for photos."""
+    exhaustive_up_to: int = 120
+    """7140 pairs, about two minutes at 800 pixels on two cores."""
+    neighbours: int = 30
+    """Similar photos each photo is compared with (retrieval; a third of it closes the loops of a sequence)."""
+    overlap: int = 10
+    """Following frames each frame is compared with (sequential), and those at 2, 4, 8 ... frames' distance."""
+    words: int = 64
+    """Centres of the image signature (VLAD) that retrieval compares; 64 as in Jegou et al. 2010."""
+    guided: bool = False
+    """Search again along epipolar lines: more matches, slower."""
+    min_inliers: int = 15
+    """Geometrically verified matches below which a pair is dropped."""
+    ransac_error: float = 4.0
+    """Pixels."""
+
+
+@dataclass(frozen=True)
+class MappingSettings:
+    """From matches to poses and points."""
+
+    mapper: str = "incremental"
+    """``incremental``, or ``global`` (GLOMAP): faster on many photos, less patient with few or weak matches."""
+    camera_model: str = "SIMPLE_RADIAL"
+    """COLMAP's name; one camera per picture size and EXIF focal length."""
+    focal_factor: float = 1.2
+    """Focal length to start from in long sides of the photo, where EXIF says none."""
+    init_min_angle: float = 16.0
+    """Degrees between the rays of the first pair; halved until a first pair is found, see ``init_trials``."""
+    init_trials: int = 3
+    """Attempts to start, each with half the angle and half the inliers of the one before."""
+    init_min_inliers: int = 100
+    min_model: int = 3
+    """Models of fewer photos do not count."""
+    refine_principal_point: bool = False
+    threads: int = 1
+    """Of the mapper. One keeps results the same on every machine; large bundle adjustments gain from more."""
+
+
+@dataclass(frozen=True)
+class WorldSettings:
+    """The frame the result is handed over in. The change of frame is recorded and can be undone."""
+
+    up: bool = True
+    """Turn the world so that +z is up: the direction across which all photos lie level."""
+    view_distance: float = 4.0
+    """Scale the world so that the median distance of a camera to the points it sees is this many units: the
+    rasteriser's near plane of 0.2 is then a twentieth of it. 0: keep the scale."""
+    center: bool = True
+    """Move the median of the points to the origin."""
+
+
+@dataclass(frozen=True)
+class SfmSettings:
+    """Poses from photos or a video.
+
+    Raises:
+        PrepareError: a value outside its documented range.
+    """
+
+    use: str = "auto"
+    """``auto``: where the capture has no poses. ``always``: also where it has. ``never``: one without is refused."""
+    features: FeatureSettings = field(default_factory=FeatureSettings)
+    matching: MatchingSettings = field(default_factory=MatchingSettings)
+    mapping: MappingSettings = field(default_factory=MappingSettings)
+    world: WorldSettings = field(default_factory=WorldSettings)
+    video: VideoSettings = field(default_factory=VideoSettings)
+    ignore_dir: str = "ignore"
+    """Folder of masks, named like the photos, whose non-zero regions (people, cars, leaves) give no features."""
+    ignore_masks: bool = True
+    """The scene's own masks (glass) give no features either: what is seen in glass moves against the scene."""
+    min_photos: int = 3
+    min_registered: float = 0.25
+    """Share of the photos that must find a pose; fewer is a failure."""
+    good_registered: float = 0.9
+    """Below it the log warns and says what to do."""
+    jpeg_quality: int = 95
+    """Of the undistorted photos."""
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for key, value, known in (
+            ("use", self.use, USE),
+            ("features.kind", self.features.kind, FEATURES),
+            ("matching.pairs", self.matching.pairs, MATCHING),
+            ("mapping.mapper", self.mapping.mapper, MAPPERS),
+        ):
+            check_choice(f"sfm.{key}", value, known)
+        for key, value, least in (
+            ("features.max_side", self.features.max_side, 64),
+            ("features.max_features", self.features.max_features, 100),
+            ("matching.neighbours", self.matching.neighbours, 1),
+            ("matching.overlap", self.matching.overlap, 1),
+            ("matching.words", self.matching.words, 2),
+            ("mapping.init_trials", self.mapping.init_trials, 1),
+            ("mapping.min_model", self.mapping.min_model, 2),
+            ("mapping.threads", self.mapping.threads, 1),
+            ("world.view_distance", self.world.view_distance, 0),
+            ("min_photos", self.min_photos, 2),
+            ("video.max_frames", self.video.max_frames, 3),
+        ):
+            if not value >= least:
+                raise PrepareError(f"setting sfm.{key}={value}: must be at least {least}")
+        if not 0 < self.video.shift < 1:
+            raise PrepareError(f"setting sfm.video.shift={self.video.shift}: must lie between 0 and 1 (long sides)")
+
+
+def check_choice(key: str, value: str, known: tuple[str, ...]) -> None:
+    """Refuse a word that is not one of ``known``.
+
+    Raises:
+        PrepareError: names the key, the value, the choices, and the nearest of them.
+    """
+    if value in known:
+        return
+    close = difflib.get_close_matches(value, known, n=1)
+    hint = f"; did you mean {close[0]!r}?" if close else ""
+    raise PrepareError(f"setting {key}={value!r} is unknown: choose one of {', '.join(known)}{hint}")
