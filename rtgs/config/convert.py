@@ -21,7 +21,8 @@ def to_run_config(composed: DictConfig, choices: Choices) -> tuple[RunConfig, Ch
     """The composed config as dataclasses: interpolations resolved, paths absolute, names derived.
 
     Raises:
-        RtgsError: a mandatory value is missing or an interpolation fails; names the key.
+        RtgsError: a mandatory value is missing or an interpolation fails (names the key); the ablation is not for the
+            method.
     """
     try:
         values = OmegaConf.to_container(composed, resolve=True, throw_on_missing=True)
@@ -29,6 +30,11 @@ def to_run_config(composed: DictConfig, choices: Choices) -> tuple[RunConfig, Ch
         raise RtgsError(f"config: {error}; set it on the command line or in its YAML file") from error
     assert isinstance(values, dict)
     config = build(RunConfig, {str(key): value for key, value in values.items()})
+    if config.ablation.methods and config.method.name not in config.ablation.methods:
+        raise RtgsError(
+            f"config: ablation={choices.ablation} takes nothing away from method {config.method.name}: it is for "
+            f"{', '.join(config.ablation.methods)}"
+        )
     scene = config.scene
     if not scene.path:
         raise RtgsError(

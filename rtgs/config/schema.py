@@ -62,6 +62,8 @@ class AblationConfig:
 
     why: str = ""
     """One line: what the flipped keys take away and what should be seen."""
+    methods: tuple[str, ...] = ()
+    """Methods that have what is taken away; others are refused. Empty: all."""
 
 
 @dataclass(frozen=True)

@@ -81,7 +81,7 @@ class McmcControl(DensityControl):
         the report, a Gaussian that moved counts as pruned here and cloned there.
         """
         opacity = surfels.opacity_logits.detach().sigmoid()
-        keep = (opacity >= self.settings.min_opacity).nonzero().flatten()
+        keep = (opacity >= self.settings.mcmc.min_opacity).nonzero().flatten()
         if len(keep) > self.cap:
             keep = opacity.argsort(descending=True, stable=True)[: self.cap].sort().values
         pruned = len(surfels) - len(keep)
@@ -98,7 +98,7 @@ class McmcControl(DensityControl):
     def _share(self, surfels: Gaussians, rows: Tensor, copies: Tensor) -> None:
         """Give ``rows`` the opacity and scales that each of ``copies`` equal Gaussians has at their place."""
         opacity = surfels.opacity_logits.detach()[rows].double().sigmoid()
-        shared = shared_opacity(opacity, copies).clamp_min(self.settings.min_opacity)  # not dead again at once
+        shared = shared_opacity(opacity, copies).clamp_min(self.settings.mcmc.min_opacity)  # not dead again at once
         surfels.opacity_logits[rows] = torch.logit(shared).float()
         surfels.log_scales[rows] += shared_shrink(opacity, copies).log().float()[:, None]
 

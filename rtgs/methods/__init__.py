@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from rtgs.methods.surfel_base import SurfelMethod
     from rtgs.scenes.scene import Scene
 
-METHOD_NAMES = ("2dgs", "rtgs")
+METHOD_NAMES = ("2dgs", "3dgs", "rtgs")
 
 
 def create_method(
@@ -53,6 +53,10 @@ def _method_class(settings: MethodSettings) -> type[SurfelMethod]:
         from rtgs.methods.gs2d import Gs2d
 
         return Gs2d
+    if settings.name == "3dgs":
+        from rtgs.methods.gs3d import Gs3d
+
+        return Gs3d
     if settings.name == "rtgs":
         from rtgs.methods.rtgs import RtGs
 

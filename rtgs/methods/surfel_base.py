@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -70,9 +70,13 @@ class SurfelMethod:
         self.schedule = schedule
         self.generator = generator
         self.extent = scene.extent
+        self.mcmc = settings.density.mcmc if settings.density.strategy == "mcmc" else None
+        init = settings.init
+        if self.mcmc is not None:
+            init = replace(init, opacity=self.mcmc.init_opacity, scale=self.mcmc.init_scale)
         self.base = SurfelSet(
             "base",
-            gaussians_from_points(self.kind, scene.points, scene.point_colors, settings.init, generator),
+            gaussians_from_points(self.kind, scene.points, scene.point_colors, init, generator),
             optimizer=settings.optimizer,
             density=settings.density,
             means_lr_steps=schedule.means_lr_steps,
@@ -171,10 +175,10 @@ class SurfelMethod:
         if _on(self.starts.distortion, step):
             assert buffers.distortion is not None
             add("distortion", distortion_loss(buffers.distortion), weights.distortion)
-        if weights.opacity > 0:
-            add("opacity", self.base.surfels.opacity_logits.sigmoid().mean(), weights.opacity)
-        if weights.scale > 0:
-            add("scale", self.base.surfels.log_scales.exp().mean() / self.extent, weights.scale)
+        if self.mcmc is not None and self.mcmc.opacity_loss > 0:
+            add("opacity", self.base.surfels.opacity_logits.sigmoid().mean(), self.mcmc.opacity_loss)
+        if self.mcmc is not None and self.mcmc.scale_loss > 0:
+            add("scale", self.base.surfels.log_scales.exp().mean() / self.extent, self.mcmc.scale_loss)
         return LossTerms(total, tuple(terms))
 
     def _normal_consistency(self, buffers: RasterBuffers, camera: Camera) -> Tensor:
@@ -279,8 +283,12 @@ def _decide_losses(
 
 
 def _decide_density(settings: MethodSettings, schedule: ScheduleSettings) -> tuple[Decision, ...]:
-    """What density control leaves out in this run."""
-    decisions = []
-    if settings.density.strategy == "mcmc" and schedule.opacity_reset_every:
+    """What density control does differently in this run."""
+    if settings.density.strategy != "mcmc":
+        return ()
+    mcmc = settings.density.mcmc
+    start = f"opacity {mcmc.init_opacity:g} and {mcmc.init_scale:g} times the size"
+    decisions = [Decision(f"initial Gaussians of {start}", "density.strategy is mcmc (density.mcmc.init_*)")]
+    if schedule.opacity_reset_every:
         decisions.append(Decision("no opacity resets", "density.strategy mcmc moves what is transparent instead"))
     return tuple(decisions)

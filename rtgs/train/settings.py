@@ -62,9 +62,6 @@ class LossSettings:
     mono_normal_form: str = "cosine"  # "cosine" (paper: 1 - n.N) or "envgs" (|difference|_1 + 1 - cos)
     distortion: float = 0.0  # 2DGS: 0 unbounded, 1000 bounded
     distortion_start: float = 0.1  # 2DGS: from 3,000 of 30,000
-    # Means over all Gaussians, from the first step (Kheradmand et al. 2024, equation 10: 0.01 each).
-    opacity: float = 0.0
-    scale: float = 0.0  # of the standard deviations, in units of the scene extent
 
     def __post_init__(self) -> None:
         _refuse_bad_numbers(self, "method.loss")
@@ -81,6 +78,14 @@ class McmcSettings:
     noise: float = 1.25e7
     noise_sharpness: float = 100.0
     noise_border: float = 0.005
+    # In this strategy's place of init.opacity, init.scale and density.min_opacity (their code):
+    init_opacity: float = 0.5
+    init_scale: float = 0.1
+    min_opacity: float = 0.005
+    # Weights of two more loss terms, means over all Gaussians (their equation 10): opacity, standard deviation in units
+    # of the scene extent (theirs: 0.01, in world units).
+    opacity_loss: float = 0.01
+    scale_loss: float = 0.05
 
     def __post_init__(self) -> None:
         _refuse_bad_numbers(self, "method.density.mcmc")
@@ -93,7 +98,7 @@ DENSITY_STRATEGIES = ("adaptive", "mcmc")
 class DensitySettings:
     """Density control (methods.md 6.1, 12)."""
 
-    strategy: str = "adaptive"  # or "mcmc": a fixed budget, no signal, no opacity resets
+    strategy: str = "adaptive"  # or "mcmc": the budget max_surfels, no signal, no opacity resets
     gradient_threshold: float = 2e-4  # mean norm of the densification signal (NDC)
     size_border: float = 0.01  # times extent: larger surfels split, smaller ones clone
     split_count: int = 2
@@ -124,8 +129,8 @@ class DensitySettings:
 class InitSettings:
     """Initial surfels from points (methods.md 2)."""
 
-    opacity: float = 0.1  # MCMC 0.5
-    scale: float = 1.0  # times the distance to the neighbours; MCMC 0.1
+    opacity: float = 0.1
+    scale: float = 1.0  # times the distance to the neighbours
     random_rotation: bool = True  # 2DGS and EnvGS; 3DGS starts from the identity
     sh_degree: int = 3
     neighbors: int = 3

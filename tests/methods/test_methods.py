@@ -42,7 +42,7 @@ def test_every_method_renders_and_lowers_its_loss(name: str):
 
 
 def test_an_unknown_method_is_refused_with_the_known_ones():
-    with pytest.raises(ValueError, match=r"method\.name is '3dgz': choose one of 2dgs, rtgs"):
+    with pytest.raises(ValueError, match=r"method\.name is '3dgz': choose one of 2dgs, 3dgs, rtgs"):
         make(replace(small_method(), name="3dgz"))
 
 

@@ -9,7 +9,7 @@ import pytest
 from rtgs.config import compose
 from rtgs.train.schedule import check_schedule, densify_due, loss_start, opacity_reset_due, sh_degree_at
 
-METHODS = ("2dgs", "rtgs")
+METHODS = ("2dgs", "3dgs", "rtgs")
 
 
 @pytest.mark.parametrize("preset", ["smoke", "quick", "standard"])
@@ -27,7 +27,8 @@ def test_short_schedules(preset: str, method: str):
     assert schedule.total - densified[-1] >= 0.15 * schedule.total, "the last surfels need time to settle"
     assert sh_degree_at(schedule, schedule.total, 3) >= 2
     assert schedule.means_lr_steps == schedule.total
-    assert loss_start(config.method.loss.normal_start, schedule.total) < schedule.total
+    if config.method.loss.normal:
+        assert loss_start(config.method.loss.normal_start, schedule.total) < schedule.total
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -38,4 +39,4 @@ def test_the_paper_preset_is_the_methods_own_schedule_and_numbers(method: str):
     assert config.method.density.max_surfels == 2_000_000
     assert config.method.optimizer.means_initial == 1.6e-4
     start = loss_start(config.method.loss.normal_start, config.schedule.total)
-    assert start == {"2dgs": 7000, "rtgs": 0}[method]
+    assert start == {"2dgs": 7000, "3dgs": 7000, "rtgs": 0}[method]

@@ -18,7 +18,7 @@ def violent(factor: float) -> OptimizerSettings:
     return replace(base, **{name: factor * getattr(base, name) for name in rates})
 
 
-@pytest.mark.parametrize("name", ["2dgs", "rtgs"])
+@pytest.mark.parametrize("name", ["2dgs", "3dgs", "rtgs"])
 def test_2000_steps_at_30_times_the_learning_rates_on_noise_stay_finite(name: str):
     settings = replace(small_method(name), optimizer=violent(30))
     scene = small_scene(noise=True, normals=True, points=150)

@@ -65,7 +65,7 @@ def small_schedule(total: int = 60, **changes: int) -> ScheduleSettings:
 def small_method(name: str = "2dgs") -> MethodSettings:
     return MethodSettings(
         name=name,
-        loss=LossSettings(normal_start=0.25, mono_normal=0.01),
+        loss=LossSettings(normal=0.0) if name == "3dgs" else LossSettings(normal_start=0.25, mono_normal=0.01),
         density=DensitySettings(gradient_threshold=5e-5, max_surfels=1200),
     )
 
