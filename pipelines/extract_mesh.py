@@ -107,5 +107,12 @@ STEP = StepKind(
     "extract_mesh",
     1,
     extract_mesh,
-    helpers=("pipelines.training", "rtgs.mesh.tsdf", "rtgs.mesh.triangles", "rtgs.methods.surfel_base", "rtgs.native"),
+    helpers=(
+        "pipelines.training",
+        "rtgs.mesh.tsdf",
+        "rtgs.mesh.triangles",
+        "rtgs.methods.surfel_base",
+        "rtgs.methods.gs3d",
+        "rtgs.native",
+    ),
 )

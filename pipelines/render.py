@@ -92,5 +92,12 @@ STEP = StepKind(
     "render",
     1,
     render,
-    helpers=("pipelines.training", "rtgs.methods.surfel_base", "rtgs.render.rasterize", "rtgs.native"),
+    helpers=(
+        "pipelines.training",
+        "rtgs.methods.surfel_base",
+        "rtgs.methods.gs3d",
+        "rtgs.render.rasterize",
+        "rtgs.render.ellipsoids",
+        "rtgs.native",
+    ),
 )

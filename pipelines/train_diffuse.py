@@ -18,6 +18,7 @@ STEP = StepKind(
     helpers=(
         "pipelines.training",
         "rtgs.methods.surfel_base",
+        "rtgs.methods.gs3d",
         "rtgs.methods.surfel_set",
         "rtgs.train.trainer",
         "rtgs.train.schedule",
@@ -30,6 +31,7 @@ STEP = StepKind(
         "rtgs.gaussians.activate",
         "rtgs.gaussians.ply",
         "rtgs.render.rasterize",
+        "rtgs.render.ellipsoids",
         "rtgs.native",
     ),
 )
