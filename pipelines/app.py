@@ -12,13 +12,14 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
+from pipelines.sweep import Sweep, current_sweep, prepared_outcomes
 from rtgs.config.compose import VERSION_BASE, choices_from
 from rtgs.config.convert import to_run_config
 from rtgs.config.locate import choices_of, conf_dir
 from rtgs.config.schema import Choices, RunConfig, register_schema
 from rtgs.errors import RtgsError
 from rtgs.pipeline import InlineExecutor, Plan, RemoteStore, StepResult, Store, make_plan
-from rtgs.track import open_tracking
+from rtgs.track import Tracking, open_tracking
 
 log = logging.getLogger("rtgs")
 
@@ -56,7 +57,6 @@ def execute(config: RunConfig, choices: Choices) -> RunOutcome:
         CaptureError: the capture cannot be read.
     """
     from pipelines.graph import build_graph, command
-    from pipelines.sweep import prepared_outcomes
     from rtgs.native import core
 
     core.isa()  # an instruction set that RTGS_ISA misspells, or that this CPU lacks, stops here and not in training
@@ -78,15 +78,36 @@ def execute(config: RunConfig, choices: Choices) -> RunOutcome:
 def _run(
     config: RunConfig, choices: Choices, stores: _Stores, plan: Plan, command: str
 ) -> tuple[tuple[StepResult, ...], Path]:
-    from pipelines.results import run_info, track_end, track_start, write_run_folder
-    from pipelines.sweep import prepared_outcomes
+    from pipelines.results import write_run_folder
 
-    executed = prepared_outcomes().executed(plan)
-    if plan.complete and not executed:  # nothing to record: the tracker saw this run when it was executed
+    tracking = open_tracking(config.tracking.kind, Path(config.paths.root), config.tracking.uri)
+    if _recorded(config, plan, tracking):
         results = InlineExecutor(stores.local).execute(plan)
         return results, write_run_folder(config, choices, command, results)
-    tracking = open_tracking(config.tracking.kind, Path(config.paths.root), config.tracking.uri)
-    with tracking.run(run_info(config, choices, plan)) as tracker:
+    sweep = current_sweep()
+    if sweep is None:
+        return _tracked(config, choices, stores, plan, command, tracking, "")
+    with tracking.sweep(sweep.group(config.tracking.experiment)) as group:
+        return _tracked(config, choices, stores, plan, command, tracking, group.id)
+
+
+def _recorded(config: RunConfig, plan: Plan, tracking: Tracking) -> bool:
+    """Nothing to record: nothing is left to run, and the tracker saw this variant when it was run.
+
+    A job of a sweep is looked up in its experiment, which may be another than the one it was recorded in; a single run
+    is not, so that repeating it stays quick.
+    """
+    if not plan.complete or prepared_outcomes().executed(plan):
+        return False
+    return current_sweep() is None or tracking.finished(config.tracking.experiment, plan.steps[-1].step.fingerprint)
+
+
+def _tracked(
+    config: RunConfig, choices: Choices, stores: _Stores, plan: Plan, command: str, tracking: Tracking, parent: str
+) -> tuple[tuple[StepResult, ...], Path]:
+    from pipelines.results import run_info, track_end, track_start, write_run_folder
+
+    with tracking.run(run_info(config, choices, plan, parent)) as tracker:
         track_start(tracker, config, plan)
         results = InlineExecutor(stores.local, tracking, stores.remote).execute(plan)
         folder = write_run_folder(config, choices, command, results)
@@ -168,6 +189,7 @@ class HydraApp:
         self.error: Exception | None = None
         self.outcomes: list[RunOutcome] = []
         self.failures: list[str] = []
+        self.sweep: Sweep | None = None
 
     def __call__(self, composed: DictConfig) -> None:
         """One job."""
@@ -175,6 +197,7 @@ class HydraApp:
         from hydra.types import RunMode
 
         hydra = HydraConfig.get()
+        self.sweep = current_sweep()
         try:
             config, choices = to_run_config(composed, choices_from(hydra.runtime.choices, hydra.overrides.task))
             self.outcomes.append(execute(config, choices))
@@ -203,7 +226,10 @@ class HydraApp:
         """Write the table that the experiment asks for, of the jobs that succeeded; the paths written."""
         from pipelines.tables import write_experiment_table
 
-        return write_experiment_table([(outcome.config, outcome.results) for outcome in self.outcomes])
+        paths = write_experiment_table([(outcome.config, outcome.results) for outcome in self.outcomes])
+        if paths and self.sweep is not None:
+            _track_table(self.outcomes[0].config, self.sweep, paths)
+        return paths
 
 
 def run_hydra(arguments: Sequence[str]) -> None:
@@ -226,6 +252,13 @@ def run_hydra(arguments: Sequence[str]) -> None:
             print(f"\n{text}")
     if app.error is not None:
         raise app.error
+
+
+def _track_table(config: RunConfig, sweep: Sweep, paths: Sequence[Path]) -> None:
+    tracking = open_tracking(config.tracking.kind, Path(config.paths.root), config.tracking.uri)
+    with tracking.sweep(sweep.group(config.tracking.experiment)) as group:
+        for path in paths:
+            group.artifact(path)
 
 
 def _know_own_launcher() -> None:

@@ -18,6 +18,7 @@ from rtgs.errors import RtgsError
 USAGE = f"""rtgs {__version__}: Gaussian models of scenes with glass and mirrors, on the CPU
 
   rtgs run [group=choice] [key=value]     train, render, measure, report; what is cached is not run again
+  rtgs run synthesize scene=NAME|all      path-trace a described scene into a capture with known truth
   rtgs plan [group=choice] [key=value]    what `rtgs run` with the same words would do, and why
   rtgs check FOLDER | scene=NAME          what is wrong with a capture, before any training
   rtgs report [RUN]                       where the report of the latest (or the named) run is
@@ -110,6 +111,11 @@ def _raised_in_project(trace: TracebackType | None) -> bool:
 
 def run(words: list[str]) -> int:
     """``rtgs run``: everything after it goes to Hydra."""
+    if words[:1] == ["synthesize"]:
+        from pipelines.synthesize import run_synthesize
+
+        run_synthesize(words[1:])
+        return 0
     from pipelines.app import run_hydra
 
     run_hydra(words)

@@ -60,7 +60,13 @@ def evaluate(params: EvaluateParams, context: StepContext) -> None:
 
 STEP = StepKind(
     "evaluate",
-    1,
+    2,
     evaluate,
-    helpers=("rtgs.evaluate.evaluate", "rtgs.evaluate.metrics", "rtgs.evaluate.lpips", "rtgs.evaluate.images"),
+    helpers=(
+        "rtgs.evaluate.evaluate",
+        "rtgs.evaluate.layers",
+        "rtgs.evaluate.metrics",
+        "rtgs.evaluate.lpips",
+        "rtgs.evaluate.images",
+    ),
 )

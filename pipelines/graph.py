@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 
-from pipelines import evaluate, extract_mesh, import_scene, render, report, sfm, train_diffuse
+from pipelines import evaluate, extract_mesh, import_scene, render, report, sfm, synthesize, train_diffuse
 from pipelines.preparation import SkippedStep, prepare
 from pipelines.training import StageParams
 from rtgs.config.schema import Choices, RunConfig
@@ -28,6 +28,7 @@ KINDS: tuple[StepKind, ...] = (
     render.STEP,
     evaluate.STEP,
     report.STEP,
+    synthesize.STEP,
 )
 """Every kind of step there is; the guard against forgotten version bumps goes through them."""
 

@@ -85,7 +85,8 @@ def read_timed(folder: Path, view_name: str) -> TimedRender:
     from rtgs.evaluate.evaluate import TimedRender
 
     seconds = json.loads((folder / TIMES_FILE).read_text(encoding="utf-8"))["seconds"]
-    return TimedRender(read_render(folder, view_name)["image"], seconds[view_name])
+    tensors = read_render(folder, view_name)
+    return TimedRender(tensors["image"], seconds[view_name], tensors.get("reflection"))
 
 
 STEP = StepKind(

@@ -17,6 +17,8 @@ from rtgs.pipeline import StepContext, StepKind
 from rtgs.pipeline.manifest import Manifest
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from rtgs.evaluate.evaluate import EvaluationTable
     from rtgs.report.figures import Curve
     from rtgs.report.page import MeshFigure, ReportView, StepLine
@@ -80,8 +82,19 @@ def _views(table: EvaluationTable, inputs: Mapping[str, Path], count: int) -> tu
         maps = read_render(inputs["render"], name)
         photo = photos[name]
         shown = {key: maps.get(key) for key in ("depth", "normal", "alpha")}
-        views.append(ReportView(name, photo.camera, photo.image, maps["image"], role, mask=photo.mask, **shown))
+        truth = {"mask": photo.mask, "truth": photo.truth}
+        views.append(
+            ReportView(name, photo.camera, photo.image, maps["image"], role, layers=_layers(maps), **truth, **shown)
+        )
     return tuple(views)
+
+
+def _layers(maps: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The layers of a rendered view as the page takes them; none for methods without reflection."""
+    if "reflection" not in maps:
+        return {}
+    names = ("reflection", "normal", "specular", "roughness", "f0")
+    return {"diffuse": (1 - maps["specular"]) * maps["diffuse"]} | {name: maps[name] for name in names if name in maps}
 
 
 def _mesh(folder: Path) -> MeshFigure:
@@ -124,4 +137,4 @@ def _steps(context: StepContext) -> tuple[StepLine, ...]:
     return tuple(lines)
 
 
-STEP = StepKind("report", 2, report, helpers=("rtgs.report.page", "rtgs.report.figures"))
+STEP = StepKind("report", 3, report, helpers=("rtgs.report.page", "rtgs.report.figures", "rtgs.report.layers"))

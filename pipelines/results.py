@@ -22,6 +22,7 @@ from rtgs.pipeline import Plan, StepResult, Store
 from rtgs.pipeline.fingerprint import flatten
 from rtgs.prepare.quality import PICTURE_FILE, REPORT_FILE
 from rtgs.track import RunInfo, Tracker
+from rtgs.track.source import git_tags
 
 if TYPE_CHECKING:
     from pipelines.preparation import SkippedStep
@@ -156,14 +157,13 @@ def _figure(value: float | None, form: str) -> str:
     return "n/a" if value is None else form.format(value)
 
 
-def run_info(config: RunConfig, choices: Choices, plan: Plan) -> RunInfo:
+def run_info(config: RunConfig, choices: Choices, plan: Plan, parent: str = "") -> RunInfo:
     """How a run appears in the tracker: names as tags, each step linked by its fingerprint."""
     target = plan.steps[-1].step
     tags = {f"rtgs.{key}": getattr(choices, key) for key in ("scene", "method", "preset", "ablation", "experiment")}
     tags |= {f"rtgs.step.{planned.step.name}": planned.step.fingerprint for planned in plan}
-    return RunInfo(
-        config.tracking.experiment, str(config.name), target.fingerprint, tags | {"rtgs.seed": str(config.seed)}
-    )
+    tags |= {"rtgs.seed": str(config.seed), **git_tags()}
+    return RunInfo(config.tracking.experiment, str(config.name), target.fingerprint, tags, parent)
 
 
 def track_start(tracker: Tracker, config: RunConfig, plan: Plan) -> None:

@@ -13,6 +13,8 @@ from rtgs.config.schema import Choices, RunConfig
 from rtgs.errors import RtgsError
 from rtgs.pipeline import RemoteStore, Step, Store, SweepOutcomes, make_plan
 from rtgs.pipeline.engine import DaskExecutor, EngineSettings, WorkerJob, open_client
+from rtgs.track import RunInfo
+from rtgs.track.source import git_tags
 
 log = logging.getLogger("rtgs")
 _PREPARED: ContextVar[SweepOutcomes | None] = ContextVar("prepared sweep", default=None)
@@ -24,6 +26,31 @@ class SweepJob:
 
     config: RunConfig
     choices: Choices
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """What the jobs of one ``--multirun`` have in common."""
+
+    id: str  # of this invocation: the name of its folder of logs
+    name: str
+
+    def group(self, experiment: str) -> RunInfo:
+        """The run that holds the jobs together in the tracker."""
+        return RunInfo(experiment, self.name, f"sweep {self.id}", {"rtgs.sweep": self.id, **git_tags()})
+
+
+def current_sweep() -> Sweep | None:
+    """The sweep that the running job belongs to; None outside of Hydra or of a sweep."""
+    from hydra.core.hydra_config import HydraConfig
+    from hydra.types import RunMode
+
+    if not HydraConfig.initialized() or (hydra := HydraConfig.get()).mode != RunMode.MULTIRUN:
+        return None
+    folder = Path(str(hydra.sweep.dir))
+    identity = f"{folder.parent.name}_{folder.name}"
+    experiment = hydra.runtime.choices.get("experiment")
+    return Sweep(identity, f"{experiment or 'sweep'} {identity}")
 
 
 def run_merged(jobs: Sequence[SweepJob], settings: EngineSettings) -> SweepOutcomes:

@@ -11,6 +11,7 @@ from hydra.errors import OverrideParseException
 
 from rtgs.config.locate import choices_of
 from rtgs.config.schema import RunConfig
+from rtgs.config.synthesize import SynthesizeConfig
 
 
 def explain(error: BaseException) -> str:
@@ -30,7 +31,8 @@ def explain(error: BaseException) -> str:
         text += _advice_for_choice(*match.groups())
     match = re.search(r"Key '([^']+)' (?:is )?not in", text)
     if match:
-        close = difflib.get_close_matches(match.group(1), sorted(all_keys(RunConfig)), n=3)
+        keys = all_keys(RunConfig) | all_keys(SynthesizeConfig)
+        close = difflib.get_close_matches(match.group(1), sorted(keys), n=3)
         text += f"\nDid you mean {' or '.join(close)}?" if close else "\n`rtgs run --help` lists all keys."
     return text
 

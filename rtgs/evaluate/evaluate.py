@@ -13,12 +13,13 @@ from typing import Protocol
 from torch import Tensor
 
 from rtgs.evaluate.images import ERROR_FULL_SCALE, error_map, error_scale_note, file_stem, write_png
+from rtgs.evaluate.layers import LAYER_METRICS, LayerTruth, layer_scores, reflection_scale, why_absent
 from rtgs.evaluate.lpips import InputRange, Lpips, lpips
 from rtgs.evaluate.metrics import psnr, quantized, ssim
 from rtgs.evaluate.weights import MissingWeights, WrongWeights
 
 FORMAT = "rtgs-evaluation"
-VERSION = 1
+VERSION = 2  # 2: the layer metrics
 # In the order of the columns. Higher is better for psnr*, ssim*; lower for lpips*.
 METRICS = (
     "psnr",
@@ -29,6 +30,7 @@ METRICS = (
     "ssim_masked",
     "lpips_01_masked",
     "lpips_11_masked",
+    *LAYER_METRICS,
     "psnr_8bit",
     "ssim_8bit",
     "lpips_01_8bit",
@@ -46,6 +48,8 @@ class PhotoView(Protocol):
     def image(self) -> Tensor: ...  # (3, H, W) in [0, 1]
     @property
     def mask(self) -> Tensor | None: ...  # (H, W) bool
+    @property
+    def truth(self) -> LayerTruth | None: ...  # of path-traced captures
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,7 @@ class TimedRender:
 
     image: Tensor  # (3, H, W)
     seconds: float | None = None  # wall time of the render call
+    reflection: Tensor | None = None  # (3, H, W) k_s w_r C_r, of methods that render it
 
 
 @dataclass(frozen=True)
@@ -96,6 +101,7 @@ class EvaluationTable:
     facts: RunFacts
     rows: tuple[ViewScore, ...]
     missing: dict[str, str] = field(default_factory=dict)  # metric -> why it is absent (in all views, or in some)
+    reflection_scale: float | None = None  # of psnr_reflection_scaled
 
     def mean(self, metric: str) -> float | None:
         """Mean over the views that have the metric; None when none has."""
@@ -163,14 +169,18 @@ def evaluate_views(
     missing: dict[str, str] = {}
     if model is None:
         missing.update({name: reason for name in METRICS if name.startswith("lpips")})
-    rows = []
+    rows, scale = [], reflection_scale(renders, views)
     for render, view in zip(renders, views, strict=True):
         try:
-            rows.append(_score(render, view, settings, model))
+            score = _score(render, view, settings, model)
+            score.values.update(layer_scores(render, view, scale))
         except (TypeError, ValueError) as error:
             raise type(error)(f"view {view.name!r}: {error}") from error
+        rows.append(score)
+    absent = [name for name in LAYER_METRICS if any(row.values[name] is None for row in rows)]
+    missing |= {name: why_absent(name, renders, views) for name in absent}
     _explain_absent(rows, settings, missing)
-    return EvaluationTable(facts, tuple(rows), missing)
+    return EvaluationTable(facts, tuple(rows), missing, scale)
 
 
 def _score(render: TimedRender, view: PhotoView, settings: EvaluationSettings, model: Lpips | None) -> ViewScore:
@@ -241,6 +251,7 @@ def write_json(path: Path, table: EvaluationTable) -> None:
         "std": {name: table.std(name) for name in METRICS},
         "count": {name: table.count(name) for name in METRICS},
         "missing": table.missing,
+        "reflection_scale": table.reflection_scale,
         "views": [asdict(row) for row in table.rows],
     }
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -261,6 +272,7 @@ def read_json(path: Path) -> EvaluationTable:
         RunFacts(**document["facts"]),
         tuple(ViewScore(**row) for row in document["views"]),
         document["missing"],
+        document["reflection_scale"],
     )
 
 

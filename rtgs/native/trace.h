@@ -50,7 +50,8 @@ struct TraceOptionsNative {
 
 // What one packet of rays met; written by the forward pass, in memory of the thread that traced it.
 struct PacketTape {
-  const int32_t* slots;   // (surfels) by ascending surfel id, so that no sum depends on the tree
+  const int32_t* ids;     // (surfels) ascending, so that no sum depends on the tree
+  const int32_t* slots;   // (surfels)
   const int32_t* places;  // (surfels) number by which the rows call it
   const float* weights;   // (surfels) sum of w over the packet's rays
   const void* rows;       // (row_count, lanes) uint16 or, if wide, int32: k-th hits of the lanes; all ones: none

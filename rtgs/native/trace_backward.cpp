@@ -54,7 +54,6 @@ class PacketBackward {
   vint load_places(int row) const;
 
   void add_surfels();
-  void prefetch(int k) const;
   void geometry_sums(const float* s, const PlaneHit& hit, int32_t place, vmask met, vfloat w, vfloat* sums);
   float* destination(int32_t slot, bool& adds);
   void sum_hits(const RayRow* const* rows, uint32_t hits, const float* weights, float* out, bool adds) const;
@@ -72,6 +71,7 @@ class PacketBackward {
   const PacketRays rays_;
 
   vfloat to_features_[32], to_colors_[3], to_normal_[3], to_depth_ = broadcast(0.f);
+  vmask finite_upstream_ = first_lanes(kLanes);
   vfloat rest_ = broadcast(0.f);  // upstream times what the hits not yet passed add to the ray
   vfloat basis_[16];
   vint last_place_ = broadcast_int(-1);
@@ -84,7 +84,9 @@ class PacketBackward {
 inline vfloat PacketBackward::upstream(const float* gradient, int stride, int component) {
   if (!gradient) return broadcast(0.f);
   const vfloat g = gather(gradient + component, rays_.ray * stride);
-  if (any(mask_not(finite(g)))) __atomic_store_n(args_.poisoned, 1, __ATOMIC_RELAXED);
+  const vmask good = finite(g);
+  finite_upstream_ = finite_upstream_ & good;
+  if (any(mask_not(good))) __atomic_store_n(args_.poisoned, 1, __ATOMIC_RELAXED);
   return where(rays_.exists, g);
 }
 inline void PacketBackward::add_rest(vfloat to_output, const float* output, int stride, int component) {
@@ -159,12 +161,15 @@ void PacketBackward::respond() {
   work_.weights.reserve(floats);
   work_.clamped.reserve(tape_.surfels);
   for (int k = 0; k < tape_.surfels; ++k) {
-    if (k + kTracePrefetch < tape_.surfels) prefetch(k + kTracePrefetch);
+    if (k + kTracePrefetch < tape_.surfels) {
+      __builtin_prefetch(record(tape_.slots[k + kTracePrefetch]));
+      prefetch_surfel(args_.surfels, tape_.ids[k + kTracePrefetch]);
+    }
     const float* s = record(tape_.slots[k]);
     const int64_t at = int64_t(tape_.places[k]) * kLanes;
     const PlaneHit hit = plane_hit(s, rays_);
     store(work_.exponents.data + at, response_exponent(s, hit.rho));
-    store(work_.to_weight.data + at, value_gradient(s, record_id(s), hit, work_.clamped[k]));
+    store(work_.to_weight.data + at, value_gradient(s, tape_.ids[k], hit, work_.clamped[k]));
     store(work_.weights.data + at, broadcast(0.f));
   }
 }
@@ -197,10 +202,6 @@ void PacketBackward::follow_rays() {
 }
 
 // ---- the sums of the surfels -------------------------------------------------------------------------------------
-inline void PacketBackward::prefetch(int k) const {
-  __builtin_prefetch(record(tape_.slots[k]));
-}
-
 inline void PacketBackward::geometry_sums(const float* s, const PlaneHit& hit, int32_t place, vmask met, vfloat w,
                                           vfloat* sums) {
   const float *n = s + kTraceNormal, *a = s + kTraceU, *b = s + kTraceV;
@@ -302,7 +303,7 @@ void PacketBackward::unclamp(uint64_t clamped, uint32_t hits, const RayRow** row
 }
 
 void PacketBackward::add_surfels() {
-  const RayRow* all_rows[kLanes];
+  const RayRow *all_rows[kLanes], *some_rows[kLanes];
   for (int lane = 0; lane < kLanes; ++lane) all_rows[lane] = &ray_rows_[lane];
   for (int k = 0; k < tape_.surfels; ++k) {
     if (args_.surfel_gradients && k + kTracePrefetch < tape_.surfels) {
@@ -320,9 +321,12 @@ void PacketBackward::add_surfels() {
     const uint32_t hits = mask_bits(met);
     alignas(64) float weights[kLanes];
     store(weights, w);
-    const RayRow* rows[kLanes];
-    memcpy(rows, all_rows, sizeof rows);
-    if (work_.clamped[k]) unclamp(work_.clamped[k], hits, rows);
+    const RayRow* const* rows = all_rows;
+    if (work_.clamped[k]) {
+      memcpy(some_rows, all_rows, sizeof some_rows);
+      unclamp(work_.clamped[k], hits, some_rows);
+      rows = some_rows;
+    }
     if (args_.surfel_gradients) {
       bool adds;
       float* out = destination(slot, adds);
@@ -332,7 +336,7 @@ void PacketBackward::add_surfels() {
     if (args_.ray_gradients && layout_.coefficients) {
       const uint32_t wanted =
           args_.options.last_sh ? hits & mask_bits(eq_int(last_place_, broadcast_int(place))) : hits;
-      add_direction(rows, wanted, weights, record_id(s));
+      add_direction(rows, wanted, weights, tape_.ids[k]);
     }
   }
 }
@@ -359,8 +363,10 @@ void PacketBackward::write_rays() {
     to_direction_[2] += (g.z - along * d.z) * inverse;
   }
   for (int k = 0; k < 3; ++k) {
-    if (args_.out_origins) scatter(args_.out_origins + k, rays_.ray * 3, to_origin_[k], rays_.exists);
-    const vfloat direction = where(rays_.usable, to_direction_[k]);  // an infinite one has no unit vector
+    vfloat origin = where(rays_.usable, to_origin_[k]), direction = where(rays_.usable, to_direction_[k]);
+    origin = select(finite_upstream_, saturated(origin), origin);
+    direction = select(finite_upstream_, saturated(direction), direction);
+    if (args_.out_origins) scatter(args_.out_origins + k, rays_.ray * 3, origin, rays_.exists);
     if (args_.out_directions) scatter(args_.out_directions + k, rays_.ray * 3, direction, rays_.exists);
   }
 }

@@ -199,13 +199,14 @@ inline void PacketTracer::keep_rest(vint settled, int rows) {
     const vint from = min_int(settled + row, broadcast_int(rows - 1));
     store_ints(work_.columns.data + row * kLanes, gather_int(work_.sorted_places.data, from * kLanes + lane));
   }
-  sort_at_ = left + 4 > kSortAt ? left + 4 : kSortAt;
+  sort_at_ = left + left / 2 > kSortAt ? left + left / 2 : kSortAt;
 }
 
 // ---- the surfels met, and the sums over them -------------------------------------------------------------------
 // Slots and places of the surfels with a weight, by ascending surfel id.
 inline void PacketTracer::list_surfels() {
   work_.keys.reserve(padded_count(places_) + kLanes);
+  work_.met_ids.reserve(places_);
   work_.met_slots.reserve(places_);
   work_.met_places.reserve(places_);
   int place_bits = 1;
@@ -218,7 +219,9 @@ inline void PacketTracer::list_surfels() {
     const int32_t id = record_id(record(work_.slots[place]));
     if (compact) work_.keys[used] = id << place_bits | place;
     else work_.long_keys[used] = uint64_t(id) << 32 | uint32_t(place);
-    used += any(gt(load(work_.weights.data + int64_t(place) * kLanes), zero));
+    const bool met = any(gt(load(work_.weights.data + int64_t(place) * kLanes), zero));
+    if (met) prefetch_surfel(args_.surfels, id);
+    used += met;
   }
   if (compact) sort_ints(work_.keys.data, used);
   else sort_long_keys(used);
@@ -226,6 +229,7 @@ inline void PacketTracer::list_surfels() {
     const int32_t place = compact ? work_.keys[k] & ((1 << place_bits) - 1) : int32_t(uint32_t(work_.long_keys[k]));
     work_.met_places[k] = place;
     work_.met_slots[k] = work_.slots[place];
+    work_.met_ids[k] = compact ? work_.keys[k] >> place_bits : int32_t(work_.long_keys[k] >> 32);
   }
   met_ = used;
 }
@@ -257,7 +261,7 @@ inline void PacketTracer::sum_channels(int first) {
   vfloat sums[B];
   for (int c = 0; c < B; ++c) sums[c] = broadcast(0.f);
   for (int k = 0; k < met_; ++k) {
-    const float* row = args_.surfels.arrays.features + int64_t(channels) * record_id(record(work_.met_slots[k])) + first;
+    const float* row = args_.surfels.arrays.features + int64_t(channels) * work_.met_ids[k] + first;
     const vfloat w = load(work_.weights.data + int64_t(work_.met_places[k]) * kLanes);
 #pragma GCC unroll 16
     for (int c = 0; c < B; ++c) sums[c] = fma(w, broadcast(row[c]), sums[c]);
@@ -279,7 +283,7 @@ inline void PacketTracer::write_colors() {
   const int rest = rest_count(args_.surfels.degree);
   for (int k = 0; k < met_; ++k) {
     const vfloat w = load(work_.weights.data + int64_t(work_.met_places[k]) * kLanes);
-    surfel_colors(args_.surfels, record_id(record(work_.met_slots[k])), rest, basis, raw);
+    surfel_colors(args_.surfels, work_.met_ids[k], rest, basis, raw);
     for (int c = 0; c < 3; ++c) sums[c] += w * max(raw[c], broadcast(0.f));
   }
   for (int c = 0; c < 3; ++c) store_component(args_.colors + c, 3, rays_, sums[c]);
@@ -300,9 +304,11 @@ inline void PacketTracer::write_normal() {
 void PacketTracer::write_tape(PacketTape& tape, TapeArena& arena) {
   const bool wide = places_ >= 0xffff;
   const int64_t row_values = int64_t(rows_) * kLanes;
+  int32_t* ids = reinterpret_cast<int32_t*>(arena_take(arena, met_ * sizeof(int32_t)));
   int32_t* slots = reinterpret_cast<int32_t*>(arena_take(arena, met_ * sizeof(int32_t)));
   int32_t* places = reinterpret_cast<int32_t*>(arena_take(arena, met_ * sizeof(int32_t)));
   float* weights = reinterpret_cast<float*>(arena_take(arena, met_ * sizeof(float)));
+  memcpy(ids, work_.met_ids.data, met_ * sizeof(int32_t));
   memcpy(slots, work_.met_slots.data, met_ * sizeof(int32_t));
   memcpy(places, work_.met_places.data, met_ * sizeof(int32_t));
   for (int k = 0; k < met_; ++k) weights[k] = sum(load(work_.weights.data + int64_t(places[k]) * kLanes));
@@ -312,7 +318,7 @@ void PacketTracer::write_tape(PacketTape& tape, TapeArena& arena) {
     if (wide) store_ints(reinterpret_cast<int32_t*>(rows) + i, row);
     else store_short(reinterpret_cast<uint16_t*>(rows) + i, row);
   }
-  tape = {slots, places, weights, rows, met_, rows_, places_, int32_t(hits_), wide};
+  tape = {ids, slots, places, weights, rows, met_, rows_, places_, int32_t(hits_), wide};
 }
 
 void PacketTracer::write(PacketTape* tape, TapeArena* arena) {
@@ -362,7 +368,7 @@ void sum_packet_weights(const TraceForwardArgs& args, float* weight_sum) {
     for (int64_t packet = 0; packet < packets; ++packet) {
       const PacketTape& tape = args.tapes[packet];
       for (int32_t k = 0; k < tape.surfels; ++k) {
-        const int32_t id = record_id(args.records + int64_t(kTraceFields) * tape.slots[k]);
+        const int32_t id = tape.ids[k];
         if (id >= begin && id < end) weight_sum[id] += tape.weights[k];
       }
     }

@@ -7,11 +7,6 @@
 namespace rtgs::RTGS_ISA {
 namespace {
 
-vfloat saturated(vfloat v) {  // infinite: the largest float of that sign; NaN, from infinities that cancel: 0
-  const vfloat zero = broadcast(0.f), largest = broadcast(3e38f);
-  return select(finite(v), v, select(gt(v, zero), largest, where(lt(v, zero), -largest)));
-}
-
 constexpr int kPrefetchGroups = 2;
 
 class GradientGroup {  // kLanes surfels from row `first` on

@@ -51,14 +51,15 @@ struct PacketRays {
     const int64_t first = packet * kLanes;
     count = int(rays.count - first < kLanes ? rays.count - first : kLanes);
     exists = first_lanes(count);
-    for (int lane = 0; lane < kLanes; ++lane) {  // lanes past the last ray repeat it, and have stopped
-      const int64_t place = first + (lane < count ? lane : count - 1);
-      ray[lane] = rays.order ? rays.order[place] : int32_t(place);
-    }
+    // Lanes past the last ray repeat it, and have stopped.
+    ray = min_int(truncate(lane_numbers()), broadcast_int(count - 1)) + int32_t(first);
+    if (rays.order) ray = gather_int(rays.order, ray);
     const vint row = ray * 3;
     ox = gather(rays.origins, row), oy = gather(rays.origins + 1, row), oz = gather(rays.origins + 2, row);
     dx = gather(rays.directions, row), dy = gather(rays.directions + 1, row), dz = gather(rays.directions + 2, row);
-    length = sqrt(dx * dx + dy * dy + dz * dz);
+    const vfloat longest = max(max(max(abs(dx), abs(dy)), abs(dz)), broadcast(1e-37f));  // no square overflows
+    const vfloat x = dx / longest, y = dy / longest, z = dz / longest;
+    length = longest * sqrt(x * x + y * y + z * z);
     least_cosine = kGrazing * length;
     t_min = rays.t_min_each ? gather(rays.t_min_each, ray) : broadcast(rays.t_min);
     t_max = rays.t_max_each ? gather(rays.t_max_each, ray) : broadcast(rays.t_max);
@@ -113,7 +114,7 @@ struct TraceWorkspace {
   Growing<int32_t> columns, sorted_places;
   Growing<float> sorted_t;
   // Composited: places by row; then the surfels met.
-  Growing<int32_t> rows, keys, met_slots, met_places;
+  Growing<int32_t> rows, keys, met_ids, met_slots, met_places;
   Growing<uint64_t> long_keys, spare_keys;
   // Of the backward pass.
   Growing<uint64_t> clamped;    // by surfel met: colours at zero, a bit per ray, 16 bits apart per channel
@@ -124,7 +125,7 @@ struct TraceWorkspace {
   void release() {
     pending.release(), t.release(), exponents.release(), weights.release(), to_weight.release(), slots.release();
     columns.release(), sorted_places.release(), sorted_t.release(), rows.release(), keys.release();
-    met_slots.release(), met_places.release(), long_keys.release(), spare_keys.release();
+    met_ids.release(), met_slots.release(), met_places.release(), long_keys.release(), spare_keys.release();
     clamped.release(), waiting_rows.release(), waiting_slots.release();
   }
 };
@@ -145,6 +146,17 @@ static inline char* arena_take(TapeArena& arena, int64_t bytes) {
   arena.free += bytes;
   arena.left -= bytes;
   return taken;
+}
+
+// What the sums over a packet's surfels will read of one.
+static inline void prefetch_surfel(const TraceSurfels& s, int64_t id) {
+  const float* features = s.arrays.features + int64_t(s.feature_count()) * id;
+  for (int c = 0; c < s.feature_count(); c += 16) __builtin_prefetch(features + c);
+  if (s.feature_count()) __builtin_prefetch(features + s.feature_count() - 1);
+  if (!s.sh_dc) return;
+  __builtin_prefetch(s.sh_dc + 3 * id);
+  const float* rest = s.sh_rest + int64_t(3) * s.rest * id;
+  for (int c = 0; c < 3 * rest_count(s.degree); c += 16) __builtin_prefetch(rest + c);
 }
 
 // Colours at a surfel: 0.5 + SH before the clamp at zero, for a packet's directions. basis holds rest_count(degree).

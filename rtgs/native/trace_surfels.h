@@ -1,6 +1,6 @@
 // What of a surfel does not depend on the ray, kLanes surfels at a time: for boxes, records and the chain rule.
 #pragma once
-#include "project_geometry.h"
+#include "project_rows.h"
 
 namespace rtgs::RTGS_ISA {
 

@@ -27,6 +27,8 @@ from rtgs.report.figures import (
     normal_picture,
     outlined,
 )
+from rtgs.report.layers import layer_pixels
+from rtgs.scenes.truth import ViewTruth
 
 TARGET_BYTES = 5_000_000  # of all pictures together, as base64
 # Tried in order until the pictures fit: long side in pixels, JPEG quality.
@@ -78,6 +80,8 @@ class ReportView:
     normal: Tensor | None = None  # (3, H, W) world frame
     alpha: Tensor | None = None  # (H, W)
     mask: Tensor | None = None  # (H, W) bool, where the masked figures are measured; outlined in the error map
+    layers: Mapping[str, Tensor] = field(default_factory=dict)  # as rtgs.report.layers.layer_pixels takes them
+    truth: ViewTruth | None = None  # of path-traced captures
 
 
 @dataclass(frozen=True)
@@ -120,6 +124,16 @@ class Picture:
 
 
 @dataclass(frozen=True)
+class LayerFigure:
+    """A layer beside its truth; what does not exist is None."""
+
+    title: str
+    caption: str
+    rendered: Picture | None
+    truth: Picture | None
+
+
+@dataclass(frozen=True)
 class ViewPanel:
     """One view as the template takes it."""
 
@@ -131,6 +145,7 @@ class ViewPanel:
     photo: Picture
     render: Picture
     maps: tuple[Picture, ...]
+    layers: tuple[LayerFigure, ...] = ()
 
 
 def pick_views(table: EvaluationTable, count: int = 4) -> list[tuple[int, str]]:
@@ -216,6 +231,10 @@ _WHEN_PRESENT = (
     Column("ssim_masked", "SSIM in mask", 4),
     Column("lpips_01_masked", "LPIPS [0,1] in mask", 4),
     Column("lpips_11_masked", "LPIPS [−1,1] in mask", 4),
+    Column("psnr_specular", "PSNR on specular objects", 2),
+    Column("psnr_diffuse_part", "PSNR off them", 2),
+    Column("psnr_reflection", "PSNR of the reflection", 2),
+    Column("psnr_reflection_scaled", "PSNR of the reflection, scaled", 2),
     Column("psnr_8bit", "PSNR 8 bit", 2),
     Column("ssim_8bit", "SSIM 8 bit", 4),
     Column("lpips_01_8bit", "LPIPS [0,1] 8 bit", 4),
@@ -327,7 +346,20 @@ def _draw(view: ReportView) -> list[_Drawn]:
 def _panel(view: ReportView, score: ViewScore, drawn: list[_Drawn], long_side: int, quality: int) -> ViewPanel:
     pictures = [_encoded(item.pixels, item.label, long_side, quality) for item in drawn]
     height, width = view.photo.shape[1:]
-    return ViewPanel(view.name, view.role, score, width, height, pictures[0], pictures[1], tuple(pictures[2:]))
+    maps, layers = tuple(pictures[2:]), _layer_figures(view, long_side, quality)
+    return ViewPanel(view.name, view.role, score, width, height, pictures[0], pictures[1], maps, layers)
+
+
+def _layer_figures(view: ReportView, long_side: int, quality: int) -> tuple[LayerFigure, ...]:
+    figures = []
+    for layer in layer_pixels(view.layers, view.render, view.photo, view.camera, view.truth):
+        both = ((layer.rendered, "rendered"), (layer.truth, "truth"))
+        rendered, truth = (
+            None if pixels is None else _encoded(pixels, Picture("", f"{layer.title}, {kind}"), long_side // 2, quality)
+            for pixels, kind in both
+        )
+        figures.append(LayerFigure(layer.title, layer.caption, rendered, truth))
+    return tuple(figures)
 
 
 def _encoded(pixels: np.ndarray, label: Picture, long_side: int, quality: int) -> Picture:
@@ -343,7 +375,8 @@ def _mesh_picture(mesh: MeshFigure | None, long_side: int, quality: int) -> Pict
 
 
 def _size(panel: ViewPanel) -> int:
-    return sum(len(picture.uri) for picture in (panel.photo, panel.render, *panel.maps))
+    layers = [picture for layer in panel.layers for picture in (layer.rendered, layer.truth) if picture]
+    return sum(len(picture.uri) for picture in (panel.photo, panel.render, *panel.maps, *layers))
 
 
 def _number(value: float | None, digits: int = 2, factor: float = 1.0) -> str:

@@ -23,6 +23,11 @@ class JsonlTracker:
         self.folder = folder
         self._stream = (folder / "events.jsonl").open("a", encoding="utf-8", buffering=1)
 
+    @property
+    def id(self) -> str:
+        """Name of the folder."""
+        return self.folder.name
+
     def write(self, kind: str, **content: object) -> None:
         """One line: time (UTC), kind, content."""
         time = datetime.now(UTC).isoformat(timespec="milliseconds")
@@ -78,7 +83,8 @@ class JsonlTracking:
         folder = self.root / safe_name(info.experiment) / name
         folder.mkdir(parents=True)
         tracker = JsonlTracker(folder)
-        tracker.write("start", name=info.name, fingerprint=info.fingerprint, tags=dict(info.tags))
+        parent = {"parent": info.parent} if info.parent else {}
+        tracker.write("start", name=info.name, fingerprint=info.fingerprint, tags=dict(info.tags), **parent)
         status = "failed"
         try:
             yield tracker
@@ -89,6 +95,28 @@ class JsonlTracking:
         finally:
             tracker.write("end", status=status)
             tracker.close()
+
+    @contextmanager
+    def sweep(self, info: RunInfo) -> Iterator[Tracker]:
+        """The folder ``<root>/<experiment>/sweep_<fingerprint>``, made or continued."""
+        folder = self.root / safe_name(info.experiment) / f"sweep_{safe_name(info.fingerprint)}"
+        new = not folder.exists()
+        folder.mkdir(parents=True, exist_ok=True)
+        tracker = JsonlTracker(folder)
+        try:
+            if new:
+                tracker.write("start", name=info.name, fingerprint=info.fingerprint, tags=dict(info.tags))
+            yield tracker
+        finally:
+            tracker.close()
+
+    def finished(self, experiment: str, fingerprint: str) -> bool:
+        """Whether a finished run of this fingerprint is recorded in this experiment."""
+        for path in (self.root / safe_name(experiment)).glob("*/events.jsonl"):
+            lines = path.read_text(encoding="utf-8").splitlines()
+            if lines and fingerprint in lines[0] and json.loads(lines[-1]).get("status") == "finished":
+                return True
+        return False
 
 
 def safe_name(name: str) -> str:

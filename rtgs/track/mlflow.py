@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from mlflow.tracking import MlflowClient
 
 FINGERPRINT_TAG = "rtgs.fingerprint"
+PARENT_TAG = "mlflow.parentRunId"  # MLflow's own: its pages fold children under it
 _FLUSH_CALLS = 50  # calls of metrics() between two writes
 _FLUSH_SECONDS = 30.0
 _BATCH_METRICS, _BATCH_PARAMS, _VALUE_LENGTH = 1000, 100, 6000  # limits of MLflow's log_batch
@@ -40,6 +41,11 @@ class MlflowTracker:
         self._metrics: list[Any] = []
         self._calls = 0
         self._written = time.monotonic()
+
+    @property
+    def id(self) -> str:
+        """MLflow's run id."""
+        return self.run_id
 
     def params(self, values: Mapping[str, Scalar]) -> None:
         """MLflow parameters (strings of at most 6,000 characters)."""
@@ -143,6 +149,8 @@ class MlflowTracking:
         experiment = self._experiment(info.experiment)
         self._reap(experiment, info.fingerprint)
         tags = {FINGERPRINT_TAG: info.fingerprint, **info.tags}
+        if info.parent:
+            tags[PARENT_TAG] = info.parent
         run_id = self.client.create_run(experiment, run_name=info.name, tags=tags).info.run_id
         tracker = MlflowTracker(self.client, run_id)
         status = "FAILED"
@@ -158,6 +166,32 @@ class MlflowTracking:
                     tracker.flush()
                 finally:
                     self.client.set_terminated(run_id, status)
+
+    @contextmanager
+    def sweep(self, info: RunInfo) -> Iterator[Tracker]:
+        """The run that groups those of a sweep; finished from the start, so that a kill leaves nothing running."""
+        experiment = self._experiment(info.experiment)
+        with FileLock(str(self.root / "mlflow.db.sweep.lock")):  # jobs of one sweep may be processes of their own
+            found = self._of(experiment, info.fingerprint)
+            if found:
+                run_id = found[0].info.run_id
+            else:
+                tags = {FINGERPRINT_TAG: info.fingerprint, **info.tags}
+                run_id = self.client.create_run(experiment, run_name=info.name, tags=tags).info.run_id
+                self.client.set_terminated(run_id, "FINISHED")
+        tracker = MlflowTracker(self.client, run_id)
+        try:
+            yield tracker
+        finally:
+            tracker.flush()
+
+    def finished(self, experiment: str, fingerprint: str) -> bool:
+        """Whether a finished run of this fingerprint is recorded in this experiment."""
+        return bool(self._of(self._experiment(experiment), fingerprint, "attributes.status = 'FINISHED' and "))
+
+    def _of(self, experiment: str, fingerprint: str, condition: str = "") -> list[Any]:
+        query = f"{condition}tags.`{FINGERPRINT_TAG}` = '{fingerprint}'"
+        return list(self.client.search_runs([experiment], query, max_results=1))
 
     def _experiment(self, name: str) -> str:
         client = self.client  # initialised before the lock below is taken: it takes the same one

@@ -14,6 +14,11 @@ from rtgs.track.protocol import RunInfo, Scalar, Tracker
 class NullTracker:
     """Accepts everything, keeps nothing."""
 
+    @property
+    def id(self) -> str:
+        """Nothing is kept, nothing can be named."""
+        return ""
+
     def params(self, values: Mapping[str, Scalar]) -> None:
         """Nothing is kept."""
 
@@ -37,3 +42,12 @@ class NullTracking:
     def run(self, info: RunInfo) -> Iterator[Tracker]:
         """A run that keeps nothing."""
         yield NullTracker()
+
+    @contextmanager
+    def sweep(self, info: RunInfo) -> Iterator[Tracker]:
+        """A run that keeps nothing."""
+        yield NullTracker()
+
+    def finished(self, experiment: str, fingerprint: str) -> bool:
+        """True: there is nothing to record here, ever."""
+        return True

@@ -17,6 +17,11 @@ Scalar = str | int | float | bool | None
 class Tracker(Protocol):
     """An open run. Implementations buffer; closing the run (leaving its context) flushes."""
 
+    @property
+    def id(self) -> str:
+        """What names this run as the ``parent`` of others; empty where nothing is kept."""
+        ...
+
     def params(self, values: Mapping[str, Scalar]) -> None:
         """Parameters, once, with dotted names (``loss.normal``)."""
         ...
@@ -43,13 +48,14 @@ class RunInfo:
     """What identifies a tracked run.
 
     ``fingerprint`` is that of the step, or of the last step of a variant; unfinished runs of the same fingerprint whose
-    process is gone are marked as killed when a new one opens.
+    process is gone are marked as killed when a new one opens. ``parent``: id of the run of the sweep it belongs to.
     """
 
     experiment: str
     name: str
     fingerprint: str
     tags: Mapping[str, str] = field(default_factory=dict)
+    parent: str = ""
 
 
 class Tracking(Protocol):
@@ -57,6 +63,14 @@ class Tracking(Protocol):
 
     def run(self, info: RunInfo) -> AbstractContextManager[Tracker]:
         """A new run. Leaving the context normally ends it as finished, by an exception as failed (killed on Ctrl-C)."""
+        ...
+
+    def sweep(self, info: RunInfo) -> AbstractContextManager[Tracker]:
+        """The run that groups those of a sweep: the one of this fingerprint, or a new one. Never left running."""
+        ...
+
+    def finished(self, experiment: str, fingerprint: str) -> bool:
+        """Whether a finished run of this fingerprint is recorded in this experiment."""
         ...
 
 

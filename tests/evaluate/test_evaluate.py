@@ -38,6 +38,7 @@ class Photo:
     name: str
     image: torch.Tensor
     mask: torch.Tensor | None = None
+    truth: None = None
 
 
 @pytest.fixture(autouse=True)

@@ -80,16 +80,21 @@ def test_a_sweep_is_one_plan_and_every_job_has_its_results(capture, tmp_path, ca
     table = (tmp_path / "tables" / "mine-smoke" / "table.md").read_text()
     assert "over 2 seeds" in table
     assert [line.split("|")[1].strip() for line in table.splitlines()[4:6]] == ["2dgs", "2dgs, no_normal_loss"]
-    first_events = [path.read_text().splitlines()[0] for path in (tmp_path / "tracking").rglob("events.jsonl")]
-    names = [json.loads(line)["name"].split()[0] for line in first_events]
+    starts = [json.loads(path.read_text().splitlines()[0]) for path in (tmp_path / "tracking").rglob("events.jsonl")]
+    names = [start["name"].split()[0] for start in starts]
     assert names.count("train_diffuse") == 4
-    assert sum(name.startswith("row-") for name in names) == 4
+    (group,) = (path for path in (tmp_path / "tracking" / "rtgs-runs").glob("sweep_*"))
+    assert [start.get("parent") for start in starts if start["name"].startswith("row-")] == [group.name] * 4
+    assert sorted(path.suffix for path in (group / "artifacts").iterdir()) == [".csv", ".html", ".md", ".tex"]
     threads = {artifact.manifest.machine["threads"] for artifact in store.artifacts("train_diffuse")}
     assert threads == {1}
 
     assert main(words) == 0
     assert "17 steps, 17 from the cache, nothing to do" in capsys.readouterr().err
-    assert len(list((tmp_path / "tracking").rglob("events.jsonl"))) == len(first_events)
+    again = [
+        path for path in (tmp_path / "tracking").rglob("events.jsonl") if not path.parent.name.startswith("sweep_")
+    ]
+    assert len(again) == len(starts) - 1  # no job is recorded twice; only the table goes to the new sweep
 
 
 def test_a_failing_job_leaves_the_others_alone_and_says_why(capture, tmp_path, capsys):

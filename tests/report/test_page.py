@@ -30,6 +30,7 @@ from rtgs.report.page import (
     render_report,
     write_report,
 )
+from rtgs.scenes.truth import ViewTruth
 
 NASTY = "<script>alert('x')</script> & \"quoted\""
 
@@ -287,3 +288,19 @@ def test_mesh_picture_shows_clay_and_the_wrong_side() -> None:
     assert turned[5, 5, 0] > turned[5, 5, 2] + 50
     behind = mesh_picture(TriangleMesh(wall - np.float32([0, 0, 9]), np.array([[0, 1, 2]])), camera)
     assert (behind == 255).all()
+
+
+def test_layers_stand_beside_their_truth() -> None:
+    size = (32, 48)
+    light, flat = torch.full((3, *size), 0.2), torch.full(size, 0.25)
+    specular, objects = torch.ones(size, dtype=torch.bool), torch.zeros(size, dtype=torch.int16)
+    truth = ViewTruth(flat, flat, torch.zeros(3, *size), objects, specular, light, light, 0 * light)
+    view = replace(report_view("view_0.jpg"), layers={"reflection": light, "roughness": flat})
+    assert 'class="layers"' not in render_report(replace(full_data()))
+    untrue = render_report(ReportData("x", table(), views=(view,)))
+    assert "Enlarge Reflection, rendered" in untrue
+    assert "<th>truth</th>" not in untrue
+    page = render_report(ReportData("x", table(), views=(replace(view, truth=truth),)))
+    assert page.count("Enlarge Reflection, rendered") == page.count("Enlarge Reflection, truth") == 1
+    assert "Enlarge Roughness, truth" not in page
+    assert "sRGB encoded" in " ".join(outline(page).text)

@@ -164,3 +164,30 @@ def test_batches_cost_little(tracking):
         for step in range(500):
             tracker.metrics({f"train/{name}": float(step) for name in "abcdef"}, step=step)
         assert time.process_time() - start < 5.0
+
+
+def test_a_sweep_groups_its_runs_and_is_found_again(tracking, tmp_path):
+    group = RunInfo("rtgs/table", "table2 today", "sweep 1", {"rtgs.sweep": "1"})
+    (tmp_path / "table.md").write_text("| a |")
+    with tracking.sweep(group) as first, tracking.run(RunInfo("rtgs/table", "variant", "c" * 64, {}, first.id)):
+        first.artifact(tmp_path / "table.md")
+    with MlflowTracking(tracking.root).sweep(group) as again:
+        assert again.id == first.id
+    found = {run.info.run_name: run for run in runs(tracking, "rtgs/table")}
+    assert set(found) == {"table2 today", "variant"}
+    assert found["variant"].data.tags["mlflow.parentRunId"] == first.id
+    assert found["table2 today"].info.status == "FINISHED"
+    assert [item.path for item in tracking.client.list_artifacts(first.id)] == ["table.md"]
+
+
+def test_only_finished_runs_count_as_recorded(tracking):
+    info = RunInfo("rtgs/recorded", "variant", "d" * 64)
+    assert not tracking.finished("rtgs/recorded", "d" * 64)
+    with pytest.raises(ValueError, match="half-way"), tracking.run(info):
+        raise ValueError("half-way")
+    assert not tracking.finished("rtgs/recorded", "d" * 64)
+    with tracking.run(info):
+        pass
+    assert tracking.finished("rtgs/recorded", "d" * 64)
+    assert not tracking.finished("rtgs/recorded", "e" * 64)
+    assert not tracking.finished("rtgs/elsewhere", "d" * 64)

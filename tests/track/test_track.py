@@ -95,3 +95,24 @@ def test_pictures_become_bytes():
 def test_names_are_safe_for_folders():
     assert safe_name("rtgs/runs: a b") == "rtgs-runs-a-b"
     assert safe_name("..") == "unnamed"
+
+
+def test_jsonl_groups_a_sweep_and_knows_what_is_recorded(tmp_path):
+    tracking = open_tracking("jsonl", tmp_path)
+    assert not tracking.finished("table", "a" * 64)
+    group = RunInfo("table", "table2", "sweep 7")
+    with tracking.sweep(group) as first, tracking.run(RunInfo("table", "variant", "a" * 64, {}, first.id)):
+        pass
+    with tracking.sweep(group) as again:
+        assert again.id == first.id
+    assert tracking.finished("table", "a" * 64)
+    assert not tracking.finished("table", "b" * 64)
+    starts = [json.loads(path.read_text().splitlines()[0]) for path in sorted(tmp_path.rglob("events.jsonl"))]
+    assert {start["name"]: start.get("parent") for start in starts} == {"variant": first.id, "table2": None}
+
+
+def test_off_has_nothing_to_record(tmp_path):
+    tracking = open_tracking("off", tmp_path)
+    assert tracking.finished("any", "a" * 64)
+    with tracking.sweep(RunInfo("any", "sweep", "s")) as group:
+        assert group.id == ""

@@ -77,25 +77,20 @@ def write_capture(
     views = make_cameras(description.viewpoints, settings.width, settings.height, settings.seed)
     for leftover in work.glob("*.tmp"):
         shutil.rmtree(leftover)
-    costs = np.array([settings.view_samples(index) for index in range(len(views))], float)
-    records = []
-    for index, camera in enumerate(views):
-        if progress:
-            progress(camera.name, costs[:index].sum() / costs.sum())
-        records.append(_finished_view(tracer, camera, index, settings, work))
-    if progress:
-        progress("points", 1.0)
-    return _assemble(tracer, views, records, settings, folder, work)
-
-
-def _finished_view(tracer: PathTracer, camera: Camera, index: int, settings: CaptureSettings, work: Path) -> ViewRecord:
-    place = work / camera.name
-    if not place.is_dir():
-        temporary = work / f"{camera.name}.tmp"
+    tell = progress or (lambda name, share: None)
+    missing = [index for index, camera in enumerate(views) if not (work / camera.name).is_dir()]
+    cost = [settings.view_samples(index) for index in range(len(views))]
+    left, total = sum(cost[index] for index in missing), sum(cost)
+    for index in missing:
+        tell(views[index].name, 1 - left / total)
+        temporary = work / f"{views[index].name}.tmp"
         temporary.mkdir(parents=True)
-        _write_view(tracer, camera, index, settings, temporary)
-        temporary.rename(place)
-    return ViewRecord.read(place)
+        _write_view(tracer, views[index], index, settings, temporary)
+        temporary.rename(work / views[index].name)
+        left -= cost[index]
+    tell("points", 1.0)
+    records = [ViewRecord.read(work / camera.name) for camera in views]
+    return _assemble(tracer, views, records, settings, folder, work)
 
 
 def _write_view(tracer: PathTracer, camera: Camera, index: int, settings: CaptureSettings, folder: Path) -> None:
@@ -208,7 +203,7 @@ def _capture_record(
     return CaptureRecord(
         name=description.name,
         title=description.title,
-        stand_in_for=getattr(description, "stand_in_for", ""),
+        stand_in_for=description.stand_in_for,
         description_sha256=description_digest(description),
         renderer=tracer.renderer,
         width=settings.width,

@@ -57,11 +57,8 @@ def feature_points(
 
 
 def _holds_features(shape: Shape) -> bool:
-    return shape.material.kind in ("diffuse", "glossy") and (shape.emission is None or _glows_with_a_picture(shape))
-
-
-def _glows_with_a_picture(shape: Shape) -> bool:
-    return getattr(shape, "glow", "plain") != "plain"
+    lit = shape.emission is None or shape.glow != "plain"  # a lamp without a picture on it holds none
+    return lit and shape.material.kind in ("diffuse", "glossy")
 
 
 def _seen(points: Array, view: PictureView) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:

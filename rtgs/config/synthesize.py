@@ -1,0 +1,50 @@
+"""What ``rtgs run synthesize`` is made of: the schema of ``conf/synthesize.yaml``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+
+from rtgs.config.build import build
+from rtgs.config.compose import VERSION_BASE, without_hydra
+from rtgs.config.locate import conf_dir
+from rtgs.config.schema import PathsConfig, open_schema
+from rtgs.scenes.synthetic.settings import CaptureSettings
+
+SCHEMA_NAME = "synthesize_schema"
+
+
+@dataclass(frozen=True)
+class SynthesizeConfig(CaptureSettings):
+    """Settings of the capture, and how and where it is made."""
+
+    variant: str | None = None
+    """Of Mitsuba: ``llvm_ad_rgb`` or ``scalar_rgb``. None: the first where LLVM is found, else the second. Does not
+    enter the recipe: both give the same pictures up to noise."""
+    output: str | None = None
+    """Folder that gets a copy of every capture, in a folder of its own with the scene's name. None: the store alone."""
+    paths: PathsConfig = field(default_factory=PathsConfig)
+
+    @property
+    def capture(self) -> CaptureSettings:
+        """What the capture depends on."""
+        return CaptureSettings(**{item.name: getattr(self, item.name) for item in fields(CaptureSettings)})
+
+
+def compose_synthesize(overrides: Sequence[str]) -> SynthesizeConfig:
+    """The config of ``rtgs run synthesize <overrides>`` without the scene.
+
+    Raises:
+        hydra.errors.HydraException: an override does not fit the schema (its cause names the key).
+        RtgsError: a value is out of range.
+    """
+    from hydra import compose, initialize_config_dir
+    from hydra.core.config_store import ConfigStore
+    from omegaconf import OmegaConf
+
+    ConfigStore.instance().store(name=SCHEMA_NAME, node=open_schema(SynthesizeConfig), provider="rtgs")
+    with initialize_config_dir(str(conf_dir()), version_base=VERSION_BASE):
+        composed = compose("synthesize", overrides=list(overrides))
+    values = OmegaConf.to_container(without_hydra(composed), resolve=True, throw_on_missing=True)
+    assert isinstance(values, dict)
+    return build(SynthesizeConfig, {str(key): value for key, value in values.items()})

@@ -1,0 +1,83 @@
+"""The layers of a view with reflection, side by side with the truth of path-traced captures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rtgs.cameras import Camera
+from rtgs.evaluate.images import to_bytes
+from rtgs.evaluate.layers import encoded
+from rtgs.report.figures import alpha_picture, normal_picture
+from rtgs.scenes.truth import ViewTruth
+
+
+@dataclass(frozen=True)
+class LayerPixels:
+    """One layer as pixels, (H, W, 3) uint8."""
+
+    title: str
+    caption: str
+    rendered: np.ndarray | None  # None: the method has no such layer
+    truth: np.ndarray | None  # None: no truth, or none of this layer
+
+
+def layer_pixels(
+    layers: Mapping[str, Tensor], image: Tensor, photo: Tensor, camera: Camera, truth: ViewTruth | None
+) -> list[LayerPixels]:
+    """Pictures of the layers of one view, in the order in which light is put together; empty without any.
+
+    Args:
+        layers: by name, all sRGB where they are colours: ``diffuse`` (3, H, W) the image without its reflection,
+            ``reflection`` (3, H, W) k_s w_r C_r, ``transmission`` (3, H, W), ``normal`` (3, H, W) world frame,
+            ``specular`` (H, W) k_s, ``roughness`` (H, W) and ``f0`` (H, W) or (3, H, W). Absent ones are left out.
+        image: (3, H, W) the render.
+        photo: (3, H, W).
+    """
+    if not layers:
+        return []
+    true = _truth_pixels(truth, camera)
+    shown = {name: to_bytes(layers[name]) for name in ("diffuse", "reflection", "transmission") if name in layers}
+    if "normal" in layers:
+        shown["normal"] = normal_picture(layers["normal"], camera)
+    for name in ("specular", "roughness", "f0"):
+        if name in layers:
+            value = layers[name]
+            shown[name] = alpha_picture(value) if value.ndim == 2 else to_bytes(value)
+    pairs = [
+        LayerPixels(title, caption, shown.get(name), true.get(name))
+        for name, (title, caption) in _TITLES.items()
+        if name in shown or (name in true and name == "transmission")
+    ]
+    final = LayerPixels("Final", "render, photo", to_bytes(image), to_bytes(photo))
+    return [*pairs, final]
+
+
+_TITLES = {
+    "diffuse": ("Diffuse", "what the base set adds to the image, (1 − k_s) C_d; truth: diffuse light, sRGB encoded"),
+    "reflection": ("Reflection", "k_s w_r C_r; truth: specularly reflected light, sRGB encoded"),
+    "transmission": ("Transmission", "truth: light through the first surface, sRGB encoded"),
+    "normal": ("Normal", "camera frame: red right, green up, blue towards the viewer"),
+    "specular": ("Specular k_s", "0 black, 1 white; truth: specular objects"),
+    "roughness": ("Roughness", "0 black, 1 white"),
+    "f0": ("f0", "reflectance at normal incidence, 0 black, 1 white"),
+}
+
+
+def _truth_pixels(truth: ViewTruth | None, camera: Camera) -> dict[str, np.ndarray]:
+    if truth is None:
+        return {}
+    world = torch.einsum("ij,ihw->jhw", camera.rotation.to(truth.normal.dtype), truth.normal)
+    pixels = {
+        "diffuse": to_bytes(encoded(truth.diffuse)),
+        "reflection": to_bytes(encoded(truth.reflected)),
+        "normal": normal_picture(world, camera),
+        "specular": alpha_picture(truth.specular.float()),
+    }
+    if bool((truth.transmitted > 0).any()):
+        pixels["transmission"] = to_bytes(encoded(truth.transmitted))
+    return pixels

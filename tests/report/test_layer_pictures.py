@@ -1,0 +1,70 @@
+"""Layers beside their truth in the report."""
+
+import torch
+
+from rtgs.cameras import Camera
+from rtgs.report.layers import layer_pixels
+from rtgs.scenes.truth import ViewTruth
+
+SIZE = (32, 48)
+
+
+def truth(transmitted: float = 0.0) -> ViewTruth:
+    normal = torch.zeros(3, *SIZE)
+    normal[2] = -1  # towards the camera, in its frame
+    light = torch.full((3, *SIZE), 0.2140)
+    specular = torch.zeros(SIZE, dtype=torch.bool)
+    specular[:, :24] = True
+    depth = torch.ones(SIZE)
+    objects = torch.zeros(SIZE, dtype=torch.int16)
+    return ViewTruth(depth, 2 * depth, normal, objects, specular, light, light / 4, transmitted * light)
+
+
+def layers() -> dict[str, torch.Tensor]:
+    normal = torch.zeros(3, *SIZE)
+    normal[2] = -1
+    flat = torch.full(SIZE, 0.25)
+    colors = {"diffuse": torch.full((3, *SIZE), 0.5), "reflection": torch.zeros(3, *SIZE)}
+    return colors | {"normal": normal, "specular": flat, "roughness": flat, "f0": flat}
+
+
+def camera() -> Camera:
+    return Camera(torch.eye(3), torch.zeros(3), 40.0, 40.0, 24.0, 16.0, 48, 32)
+
+
+def test_each_layer_stands_beside_its_truth():
+    photo = torch.rand(3, *SIZE)
+    found = {item.title: item for item in layer_pixels(layers(), photo, photo, camera(), truth())}
+    assert list(found) == ["Diffuse", "Reflection", "Normal", "Specular k_s", "Roughness", "f0", "Final"]
+    diffuse, final = found["Diffuse"], found["Final"]
+    assert diffuse.rendered is not None
+    assert diffuse.truth is not None
+    assert abs(int(diffuse.rendered[0, 0, 0]) - int(diffuse.truth[0, 0, 0])) <= 1  # sRGB of 0.214 is one half
+    assert final.rendered is not None
+    assert (final.rendered == final.truth).all()
+    normal, specular = found["Normal"], found["Specular k_s"]
+    assert normal.truth is not None
+    assert (normal.rendered == normal.truth).all()
+    assert specular.truth is not None
+    assert (specular.truth[0, 0, 0], specular.truth[0, 47, 0]) == (255, 0)
+    assert found["Roughness"].truth is None
+
+
+def test_a_turned_camera_does_not_turn_the_true_normals():
+    turned = Camera(torch.tensor([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]), torch.zeros(3), 40.0, 40.0, 24.0, 16.0, 48, 32)
+    photo = torch.rand(3, *SIZE)
+    straight = layer_pixels(layers(), photo, photo, camera(), truth())[2]
+    assert (layer_pixels(layers(), photo, photo, turned, truth())[2].truth == straight.truth).all()
+
+
+def test_light_through_glass_is_shown_where_there_is_some():
+    photo = torch.rand(3, *SIZE)
+    titles = [item.title for item in layer_pixels(layers(), photo, photo, camera(), truth(1.0))]
+    assert titles[2] == "Transmission"
+
+
+def test_without_layers_there_are_none_and_without_truth_one_row():
+    photo = torch.rand(3, *SIZE)
+    assert layer_pixels({}, photo, photo, camera(), truth()) == []
+    found = layer_pixels(layers(), photo, photo, camera(), None)
+    assert all(item.truth is None for item in found[:-1])
