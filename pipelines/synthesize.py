@@ -107,14 +107,16 @@ def run_synthesize(words: Sequence[str]) -> None:
         return
     files = scene_files([word for word in words if word.startswith("scene=")])
     config = compose_synthesize([word for word in words if not word.startswith("scene=")])
+    places = {file.stem: Path(config.output) / file.stem for file in files} if config.output is not None else {}
+    for place in places.values():
+        _check_replaceable(place)
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     steps = [synthesize_step(read_description(file), file, config.capture, config.variant) for file in files]
     store = Store(Path(config.paths.root) / "store")
     for result in InlineExecutor(store).execute(make_plan(steps, store)):
         name = result.step.params.scene
-        place = result.folder
-        if config.output is not None:
-            place = Path(config.output) / name
+        place = places.get(name, result.folder)
+        if name in places:
             export(result.folder, place)
         print(f"{name}: {place}\n  rtgs run scene.path={place}")
 
@@ -160,16 +162,21 @@ def export(artifact: Path, place: Path) -> None:
         RtgsError: something else is there.
     """
     from rtgs.pipeline.manifest import NAME
-    from rtgs.scenes.synthetic.record import CAPTURE_RECORD
 
-    if place.exists() and not (place / CAPTURE_RECORD).is_file():
-        raise RtgsError(f"synthesize: {place} is there and is no synthetic capture: give another output folder")
+    _check_replaceable(place)
     place.parent.mkdir(parents=True, exist_ok=True)
     fresh = place.with_name(f"{place.name}.tmp")
     shutil.rmtree(fresh, ignore_errors=True)
     shutil.copytree(artifact, fresh, ignore=shutil.ignore_patterns(NAME))
     shutil.rmtree(place, ignore_errors=True)
     fresh.rename(place)
+
+
+def _check_replaceable(place: Path) -> None:
+    from rtgs.scenes.synthetic.record import CAPTURE_RECORD
+
+    if place.exists() and not (place / CAPTURE_RECORD).is_file():
+        raise RtgsError(f"synthesize: {place} is there and is no synthetic capture: give another output folder")
 
 
 class Display(Protocol):

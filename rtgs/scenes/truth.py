@@ -5,7 +5,7 @@
 | file | content | precision |
 |---|---|---|
 | ``depth.png``, ``second_depth.png`` | 16-bit grey x ``scale`` (text chunk, metres a step): z-depth, 0 = nothing | half a step: 1/131070 of the view's largest depth |
-| ``normal.png`` | 8-bit RGB, 2 rgb / 255 - 1, camera frame (x right, y down, z forward); black = nothing | 0.25 degrees at most after normalisation |
+| ``normal.png`` | 8-bit RGB, 2 rgb / 255 - 1, camera frame (x right, y down, z forward); black = nothing | 0.4 degrees at most |
 | ``objects.png`` | 8-bit grey: shape id + 1, 0 = nothing | exact |
 | ``specular.png`` | 1 bit: mirror, glossy or glass | exact |
 | ``diffuse.png``, ``reflected.png``, ``transmitted.png`` | 8-bit sRGB curve of light / ``scale`` (text chunk, a power of two) | half a step of 8 bits; the brightest 0.1 % of a layer may be clipped at ``scale`` |

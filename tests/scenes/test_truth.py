@@ -1,0 +1,150 @@
+"""The truth of a view: written, read, shrunk, carried by the importer and the cached scene."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from rtgs.scenes.canonical import capture_digest, read_scene, save_scene
+from rtgs.scenes.scene import load_scene
+from rtgs.scenes.settings import CaptureError, SceneSettings
+from rtgs.scenes.truth import LAYERS, ViewTruth, linear_from_srgb, read_truth, srgb_from_linear, write_truth
+
+SIZE = (24, 32)
+
+
+def drawn_truth(seed: int = 0, size: tuple[int, int] = SIZE, brightest: float = 0.9) -> ViewTruth:
+    generator = torch.Generator().manual_seed(seed)
+    height, width = size
+
+    def uniform(*shape: int) -> torch.Tensor:
+        return torch.rand(*shape, generator=generator)
+
+    known = uniform(height, width) > 0.1
+    depth = (0.5 + 5 * uniform(height, width)) * known
+    normal = torch.nn.functional.normalize(uniform(3, height, width) - 0.5, dim=0) * known
+    objects = torch.where(known, (uniform(height, width) * 20).short(), torch.tensor(-1, dtype=torch.int16))
+    lights = {name: brightest * uniform(3, height, width) ** 2 for name in LAYERS}
+    return ViewTruth(depth, depth * 1.3, normal, objects, (uniform(height, width) > 0.5) & known, **lights)
+
+
+def test_what_is_read_is_what_was_written_within_the_documented_error(tmp_path):
+    truth = drawn_truth()
+    write_truth(tmp_path, truth)
+    read = read_truth(tmp_path)
+    for name, tensor in truth.tensors().items():
+        assert read.tensors()[name].dtype == tensor.dtype, name
+        assert read.tensors()[name].shape == tensor.shape, name
+    for name in ("depth", "second_depth"):
+        written, found = getattr(truth, name), getattr(read, name)
+        assert (written - found).abs().max() <= written.max() / 131070 * 1.01
+        assert ((written == 0) == (found == 0)).all()
+    assert (read.objects == truth.objects).all()
+    assert (read.specular == truth.specular).all()
+    known = truth.objects >= 0
+    cosine = (truth.normal * read.normal).sum(0)[known].clamp(max=1)
+    assert torch.rad2deg(torch.arccos(cosine)).max() < 0.4
+    assert (read.normal[:, ~known] == 0).all()
+    for name in LAYERS:
+        encoded = [srgb_from_linear(getattr(view, name).numpy()) for view in (truth, read)]
+        assert np.abs(encoded[0] - encoded[1]).max() <= 0.5 / 255 + 1e-6
+
+
+def test_bright_light_keeps_its_scale_and_sparks_are_clipped(tmp_path):
+    truth = drawn_truth(size=(64, 64), brightest=6.0)
+    truth.reflected[:, 3, 4] = 500.0
+    write_truth(tmp_path, truth)
+    read = read_truth(tmp_path)
+    assert float(read.reflected[:, 3, 4].max()) == pytest.approx(8.0)
+    ordinary = truth.reflected < 6.0
+    error = (truth.reflected - read.reflected)[ordinary].abs()
+    assert error.max() < 8 * 2.4 * 1.1 / 510  # slope of the inverse curve at 1, half a step
+
+
+def test_the_curve_and_its_inverse():
+    values = np.linspace(0, 1, 1001)
+    np.testing.assert_allclose(linear_from_srgb(srgb_from_linear(values)), values, atol=1e-6)
+    assert srgb_from_linear(np.array([0.2158605])) == pytest.approx(128 / 255, abs=1e-3)
+    np.testing.assert_allclose(srgb_from_linear(np.array([-1.0, 4.0])), [0.0, 1.0], atol=1e-12)
+
+
+def test_shrinking_averages_light_and_picks_geometry():
+    truth = drawn_truth()
+    small = truth.resized(16, 12)
+    assert small.depth.shape == (12, 16)
+    assert small.normal.shape == (3, 12, 16)
+    torch.testing.assert_close(
+        small.reflected, torch.nn.functional.avg_pool2d(truth.reflected, 2), atol=1e-6, rtol=1e-5
+    )
+    assert set(small.depth.unique().tolist()) <= set(truth.depth.unique().tolist())
+    torch.testing.assert_close(small.depth, truth.depth[1::2, 1::2])
+    assert (small.objects == truth.objects[1::2, 1::2]).all()
+    assert truth.resized(32, 24) is truth
+
+
+@pytest.fixture
+def capture(tmp_path):
+    """Nine photos with poses; truth of the first and the last, which are the test views."""
+    folder = tmp_path / "capture"
+    (folder / "images").mkdir(parents=True)
+    (folder / "sparse" / "0").mkdir(parents=True)
+    (folder / "sparse" / "0" / "cameras.txt").write_text("1 PINHOLE 32 24 30.0 30.0 16.0 12.0\n")
+    lines, rng = [], np.random.default_rng(0)
+    for index in range(9):
+        x = 0.3 * index
+        lines.append(f"{index + 1} 1 0 0 0 {-x} 0 0 1 view_{index}.png\n\n")
+        Image.fromarray(rng.integers(0, 255, (24, 32, 3), dtype=np.uint8)).save(folder / f"images/view_{index}.png")
+    (folder / "sparse" / "0" / "images.txt").write_text("".join(lines))
+    points = "".join(f"{i + 1} {0.1 * i} {0.05 * (i % 7)} {2 + 0.1 * (i % 5)} 9 9 9 0.5\n" for i in range(40))
+    (folder / "sparse" / "0" / "points3D.txt").write_text(points)
+    for index in (0, 8):
+        write_truth(folder / "truth" / f"view_{index}", drawn_truth(index))
+    return folder
+
+
+def test_the_importer_carries_the_truth_of_test_views_and_the_cache_keeps_it(capture, tmp_path):
+    scene = load_scene(SceneSettings(path=str(capture), long_side=16))
+    assert [view.name for view in scene.test] == ["view_0.png", "view_8.png"]
+    assert all(view.truth is None for view in scene.train)
+    expected = read_truth(capture / "truth" / "view_8").resized(16, 12)
+    save_scene(scene, tmp_path / "canonical")
+    for found in (scene.test[1].truth, read_scene(tmp_path / "canonical").test[1].truth):
+        assert found is not None
+        for name, tensor in expected.tensors().items():
+            assert torch.equal(found.tensors()[name], tensor), name
+
+
+def test_the_digest_knows_the_truth(capture):
+    settings = SceneSettings(path=str(capture))
+    before = capture_digest(settings)
+    Image.fromarray(np.zeros((24, 32), np.uint8)).save(capture / "truth" / "view_0" / "objects.png")
+    assert capture_digest(settings) != before
+
+
+def test_bad_truth_is_refused_with_its_name(capture):
+    settings = SceneSettings(path=str(capture))
+    write_truth(capture / "truth" / "view_0", drawn_truth(0, (12, 16)))
+    with pytest.raises(CaptureError, match=r"truth .*view_0 is of a 16x12 .*32x24"):
+        load_scene(settings)
+    write_truth(capture / "truth" / "view_0", drawn_truth(0))
+    Image.fromarray(np.zeros((5, 5), np.uint16)).save(capture / "truth" / "view_0" / "depth.png")
+    with pytest.raises(CaptureError, match="pictures of the sizes"):
+        load_scene(settings)
+    Image.fromarray(np.zeros((24, 32), np.uint16)).save(capture / "truth" / "view_0" / "depth.png")
+    with pytest.raises(CaptureError, match=r"depth.png has no scale"):
+        load_scene(settings)
+    (capture / "truth" / "view_0" / "depth.png").write_bytes(b"no picture")
+    with pytest.raises(CaptureError, match=r"depth.png cannot be read"):
+        load_scene(settings)
+    (capture / "truth" / "view_0" / "depth.png").unlink()
+    with pytest.raises(CaptureError, match=r"1 of 16 truth pictures do not exist"):
+        load_scene(settings)
+
+
+def test_more_shapes_than_the_format_tells_apart_are_refused(tmp_path):
+    truth = drawn_truth()
+    many = replace(truth, objects=torch.full_like(truth.objects, 300))
+    with pytest.raises(ValueError, match="shape id 300"):
+        write_truth(tmp_path, many)
