@@ -9,7 +9,10 @@ Training: PSNR and SSIM of the held-out views against CPU seconds of training, f
 surfels, and the number of steps with the schedule shrunk along. Each run starts from the preset ``quick``; one run per
 point. Peak memory is that of each run where the kernel lets a process reset it (Linux), else of the process so far.
 
-Writes ``speed_error.png`` and ``speed_error.json`` into ``benchmarks/results`` and prints the JSON as its last line.
+Tracer: time against error of what makes it faster (``benchmarks.trace_levers``), plotted apart.
+
+Writes ``speed_error.png``, ``speed_error_tracer.png`` and ``speed_error.json`` into ``benchmarks/results`` and prints
+the JSON as its last line.
 """
 
 from __future__ import annotations
@@ -32,6 +35,8 @@ from torch import Tensor
 
 from benchmarks.machine import machine, peak_memory_mb
 from benchmarks.speed_error_plot import GRADIENT_BOUND, PICTURE_BOUND, draw
+from benchmarks.trace_levers import defaults, lever_figures
+from benchmarks.trace_levers_plot import draw_levers
 from benchmarks.yardstick_scene import HEIGHT, SCALES, WIDTH, made_arrays
 from rtgs.cameras import Camera
 from rtgs.native import core
@@ -47,6 +52,7 @@ INPUTS = ("means", "tangent_u", "tangent_v", "scales", "opacities", "features")
 PICTURES = ("features", "alpha", "depth", "normal")
 TWIN_ROUNDS = 2  # the dense twins take seconds
 METHOD, PRESET = "rtgs", "quick"
+PARTS = ("kernel", "training", "tracer")
 
 
 @dataclass(frozen=True)
@@ -268,7 +274,7 @@ def scenes_here() -> list[str]:
 def measure(arguments: argparse.Namespace, kept: dict[str, Any]) -> dict[str, Any]:
     """All figures that were asked for, and those of ``kept`` for parts that were not."""
     figures: dict[str, Any] = {"machine": machine(), "kernel": None, "training": [], "training_runs_per_point": 1}
-    figures |= {"training_threads": arguments.threads} | kept
+    figures |= {"training_threads": arguments.threads, "tracer": None} | kept
     if "training" in arguments.parts:  # first: memory that the twins leave behind is not training's
         torch.set_num_threads(arguments.threads)
         figures |= {"training_threads": arguments.threads, "training": []}
@@ -285,6 +291,11 @@ def measure(arguments: argparse.Namespace, kept: dict[str, Any]) -> dict[str, An
                 f"{key} {value:.3g}" if isinstance(value, float) else f"{key} {value}" for key, value in values.items()
             )
             print(f"{name:14}", "  ".join(words))
+    if "tracer" in arguments.parts:
+        torch.set_num_threads(1)
+        figures["tracer"] = lever_figures(arguments.lever_surfels, max(2, arguments.rounds // 6))
+        for point in figures["tracer"]["points"]:
+            print("  ".join(f"{key} {value}" for key, value in point.items()))
     return figures
 
 
@@ -292,10 +303,11 @@ def parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])  # type: ignore[union-attr]
     add = parser.add_argument
     add("--quick", action="store_true", help="under two minutes: a smaller kernel scene, three short runs of demo")
-    add("--parts", nargs="*", choices=("kernel", "training"), default=["kernel", "training"])
+    add("--parts", nargs="*", choices=PARTS, default=list(PARTS))
     add("--surfels", type=int, help="of the kernel scene (1000; quick: 500)")
     add("--width", type=int, help="of the kernel scene's picture in pixels (96; quick: 64)")
     add("--rounds", type=int, help="of the native kernels (30; quick: 10)")
+    add("--lever-surfels", type=int, choices=(20_000, 100_000), help="of the tracer's levers (100,000; quick: 20,000)")
     add("--scenes", nargs="+", help="scene configs (demo, and fox where RTGS_SHARED has it; quick: demo)")
     add("--steps", type=int, nargs="+", help="lengths of training at the largest cap")
     add("--caps", type=int, nargs="+", help="caps on surfels at the most steps")
@@ -309,6 +321,7 @@ def parse() -> argparse.Namespace:
         "surfels": 500 if quick else 1000,
         "width": 64 if quick else 96,
         "rounds": 10 if quick else 30,
+        "lever_surfels": 20_000 if quick else 100_000,
         "scenes": ["demo"] if quick else scenes_here(),
         "steps": [250, 500, 1000] if quick else [500, 1000, 2000],
         "caps": [10_000] if quick else [5_000, 10_000, 20_000, 40_000],
@@ -327,6 +340,8 @@ def main() -> None:
     record.parent.mkdir(parents=True, exist_ok=True)
     record.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
     draw(figures, arguments.output / f"{NAME}.png")
+    if figures["tracer"]:
+        draw_levers(figures, defaults(), arguments.output / f"{NAME}_tracer.png")
     print(json.dumps(figures))
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks import gaussians, losses, raster, sfm, speed_error, train_step
+from benchmarks import gaussians, losses, raster, sfm, speed_error, trace, trace_levers, trace_scene, train_step
 from rtgs.native import core
 
 
@@ -44,6 +44,47 @@ def test_raster(run) -> None:
     assert figures["machine"]["isa"] == core.isa()
 
 
+@pytest.fixture
+def few_rays(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A hundredth of the rays: the shape of the answer, not its figures."""
+    for module in (trace_scene, trace_levers):
+        monkeypatch.setattr(module, "WIDTH", 40)
+        monkeypatch.setattr(module, "HEIGHT", 28)
+
+
+@pytest.mark.usefixtures("few_rays")
+def test_trace(run) -> None:
+    figures = run(trace, "--repeat", "1", "--counts", "20000")
+    assert figures["prototype"] is False
+    for rays in ("cam", "refl"):
+        for name in ("forward", "backward", "build", "refit", "full", "sh3"):
+            assert figures[f"ratio_{name}_20k_{rays}"] is None, "without the prototype there is nothing to compare with"
+        assert set(figures[f"ms_20k_{rays}"]) == {"features", "full", "sh3"}
+        assert figures[f"cost_of_sh3_20k_{rays}"] > 0
+        assert 5 < figures[f"hits_per_ray_20k_{rays}"] < 100
+    assert set(figures["incoherent_auto_takes"].values()) <= {"given", "sorted"}
+    assert all(figures[key] > 0 for key in ("ratio_incoherent", "speedup_2_threads", "peak_memory_mb"))
+
+
+@pytest.mark.usefixtures("few_rays")
+def test_speed_error_of_the_tracer(run, tmp_path: Path) -> None:
+    figures = run(speed_error, "--quick", "--parts", "tracer", "--rounds", "2", "--output", str(tmp_path))
+    points = figures["tracer"]["points"]
+    levers = {point["lever"] for point in points}
+    assert levers == {
+        *("transmittance_cutoff", "alpha_cutoff", "refit_interval", "traced_share", "traced_block"),
+        *("specular_threshold", "resolution"),
+    }
+    assert all(point["ms"] > 0 and point["relative_time"] > 0 for point in points)
+    for lever in ("transmittance_cutoff", "alpha_cutoff"):
+        errors = [point["gradient_error"] for point in points if point["lever"] == lever]
+        assert errors == sorted(errors), "a looser cut is less exact"
+        assert errors[0] < 0.1
+    for lever, default in trace_levers.defaults().items():
+        assert any(p["setting"] == default for p in points if p["lever"] == lever), "the default is among the settings"
+    assert (tmp_path / "speed_error_tracer.png").read_bytes().startswith(b"\x89PNG")
+
+
 def test_train_step(run) -> None:
     figures = run(train_step, "--rounds", "1")
     parts = ("activate", "raster", "photometric", "normal", "adam", "density")
@@ -73,7 +114,7 @@ def test_gaussians(run) -> None:
 def test_speed_error(run, tmp_path: Path) -> None:
     kernel = ("--quick", "--surfels", "60", "--width", "32", "--rounds", "2")
     training = ("--scenes", "demo", "--steps", "2", "3", "--caps", "2000", "--long-side", "32")
-    figures = run(speed_error, *kernel, *training, "--output", str(tmp_path))
+    figures = run(speed_error, "--parts", "kernel", "training", *kernel, *training, "--output", str(tmp_path))
     paths = figures["kernel"]["paths"]
     assert set(paths) == {*core.available_isas(), "twin_float32", "twin_float64"}
     assert all(path["ms"] > 0 for path in paths.values())
