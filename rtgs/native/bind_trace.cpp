@@ -40,6 +40,8 @@ class Tracing {
           int threads)
       : isa_(active_isa()), options_{transmittance_cutoff, alpha_cutoff, last_sh, threads < 1 ? 1 : threads},
         sh_degree_(sh_degree), order_(order), memory_(TraceMemoryPool::instance().take()) {
+    if (order != "given" && order != "sorted" && order != "auto")
+      throw std::invalid_argument("trace: order '" + order + "' is not one of given, sorted, auto");
     memory_->set_threads(options_.threads);
   }
   ~Tracing() { TraceMemoryPool::instance().give(std::move(memory_)); }
@@ -67,6 +69,8 @@ class Tracing {
     args.rays.t_max = t_max;
     args.options = options_;
     args.tree = tree.view();
+    sorted_ = order_ != "given" && sort_rays(args.rays, args.tree);
+    args.rays.order = sorted_ ? m.order.get() : nullptr;
     float* records = m.records.reserve(kTraceFields * (count + 1));
     RTGS_CALL(isa_, trace_records, surfels_.arrays, args.tree, options_.alpha_cutoff, records,
               m.slots.reserve(count + 1), options_.threads);
@@ -162,6 +166,21 @@ class Tracing {
     rays.directions = directions.data();
     rays.order = sorted_ ? memory_->order.get() : nullptr;
     return rays;
+  }
+
+  bool sort_rays(const TraceRays& rays, const TreeView& tree) {
+    TraceMemory& m = *memory_;
+    RayOrderArgs args{};
+    args.rays = rays;
+    args.tree = tree;
+    args.always = order_ == "sorted";
+    args.coordinates = m.coordinates.reserve(5 * (rays.count + 1));
+    args.keys = m.keys.reserve(rays.count + 1);
+    args.spare = m.spare_keys.reserve(rays.count + 1);
+    args.scratch = m.scratch.reserve(RTGS_CALL(isa_, order_scratch));
+    args.order = m.order.reserve(rays.count + 16);
+    args.threads = options_.threads;
+    return RTGS_CALL(isa_, order_rays, args);
   }
 
   std::vector<TapeArena> fresh_arenas(std::vector<ArenaBlocks>& blocks) const {

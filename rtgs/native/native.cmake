@@ -16,6 +16,7 @@ set(RTGS_KERNELS
   ellipsoid_tiles.cpp
   bvh_boxes.cpp
   trace_records.cpp
+  trace_order.cpp
   trace_forward.cpp
   trace_backward.cpp
   trace_gradients.cpp)

@@ -1,56 +1,15 @@
 // Which Gaussians touch which tile, front to back: one stable radix sort by depth, then a counting sort by tile. Every
 // step is a stable partition, so the lists do not depend on the number of threads.
-#include <cstring>
-
-#include <omp.h>
-
+#include "radix.h"
 #include "raster.h"
 
 namespace rtgs::RTGS_ISA {
 namespace {
 
-constexpr int kDigitBits = 11, kDigits = 1 << kDigitBits;
-constexpr int kMaxThreads = 64;  // of the sort: bounds the histograms, see sort_scratch
-
-struct Chunk {
-  int64_t begin, end;
-};
-Chunk chunk_of(int64_t count, int part, int parts) { return {count * part / parts, count * (part + 1) / parts}; }
-
-int clipped_threads(int threads, int64_t count) {
-  const int64_t useful = count / 4096 + 1;
-  if (threads > useful) threads = int(useful);
-  return threads < kMaxThreads ? threads : kMaxThreads;
-}
-
 uint32_t depth_bits(float depth) {  // positive floats order like their bits
   uint32_t bits;
   memcpy(&bits, &depth, sizeof bits);
   return bits;
-}
-
-// One stable pass over an 11-bit digit. histograms: (threads, kDigits).
-void radix_pass(const DepthKey* in, DepthKey* out, int64_t count, int shift, int threads, int64_t* histograms) {
-#pragma omp parallel num_threads(threads) if (threads > 1)
-  {
-    const int parts = omp_get_num_threads(), part = omp_get_thread_num();
-    const Chunk chunk = chunk_of(count, part, parts);
-    int64_t* mine = histograms + int64_t(part) * kDigits;
-    memset(mine, 0, kDigits * sizeof(int64_t));
-    for (int64_t k = chunk.begin; k < chunk.end; ++k) ++mine[in[k].depth >> shift & (kDigits - 1)];
-#pragma omp barrier
-#pragma omp single
-    {
-      int64_t start = 0;
-      for (int digit = 0; digit < kDigits; ++digit)
-        for (int p = 0; p < parts; ++p) {
-          int64_t size = histograms[int64_t(p) * kDigits + digit];
-          histograms[int64_t(p) * kDigits + digit] = start;
-          start += size;
-        }
-    }
-    for (int64_t k = chunk.begin; k < chunk.end; ++k) out[mine[in[k].depth >> shift & (kDigits - 1)]++] = in[k];
-  }
 }
 
 }  // namespace
@@ -64,10 +23,7 @@ int64_t sort_by_depth(const ProjectedGaussians& gaussians, int64_t count, DepthK
     spare[visible] = {depth_bits(gaussians.depths[id]), uint32_t(id)};
     visible += gaussians.rects[id].x1 >= gaussians.rects[id].x0;
   }
-  threads = clipped_threads(threads, visible);
-  radix_pass(spare, keys, visible, 0, threads, scratch);
-  radix_pass(keys, spare, visible, kDigitBits, threads, scratch);
-  radix_pass(spare, keys, visible, 2 * kDigitBits, threads, scratch);
+  radix_sort(spare, keys, visible, scratch, threads);
   return visible;
 }
 

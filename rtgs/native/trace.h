@@ -48,6 +48,17 @@ struct TraceOptionsNative {
   int threads;
 };
 
+struct RayOrderArgs {
+  TraceRays rays;
+  TreeView tree;
+  bool always;          // sort; else only where it seems to pay
+  float* coordinates;   // (5, R)
+  DepthKey *keys, *spare;  // (R)
+  int64_t* scratch;     // order_scratch()
+  int32_t* order;       // (R) result
+  int threads;
+};
+
 // What one packet of rays met; written by the forward pass, in memory of the thread that traced it.
 struct PacketTape {
   const int32_t* ids;     // (surfels) ascending, so that no sum depends on the tree
@@ -118,6 +129,8 @@ struct TraceGradients {  // null: not wanted
   int first_coefficient(const TraceSurfels&);                                                                         \
   void trace_records(const SurfelArrays&, const TreeView&, float alpha_cutoff, float* records, int32_t* slots,        \
                      int threads);                                                                                    \
+  bool order_rays(const RayOrderArgs&);                                                                               \
+  int64_t order_scratch();                                                                                            \
   void trace_forward(TraceForwardArgs&);                                                                              \
   void sum_packet_weights(const TraceForwardArgs&, float* weight_sum);                                                \
   void trace_backward(const TraceBackwardArgs&);                                                                      \

@@ -29,8 +29,10 @@ struct TraceMemory {
   Buffer<float> rows;  // one gradient row per slot
   Buffer<uint8_t> touched;
   Buffer<int32_t> slots, order, owners;
+  Buffer<float> coordinates;  // of the rays, to order them
+  Buffer<DepthKey> keys, spare_keys;
   Buffer<PacketTape> tapes;
-  Buffer<int64_t> ranges;
+  Buffer<int64_t> ranges, scratch;
   std::vector<ArenaBlocks> tape_blocks;  // one per thread
   std::vector<void*> workspaces;                         // likewise
 
