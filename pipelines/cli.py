@@ -1,4 +1,4 @@
-"""The ``rtgs`` command: run, plan, cache, check, weights, report, dashboard."""
+"""The ``rtgs`` command: run, plan, cache, check, show, weights, report, dashboard."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ USAGE = f"""rtgs {__version__}: Gaussian models of scenes with glass and mirrors
   rtgs plan [group=choice] [key=value]    what `rtgs run` with the same words would do, and why
   rtgs check FOLDER | scene=NAME          what is wrong with a capture, before any training
   rtgs report [RUN]                       where the report of the latest (or the named) run is
+  rtgs show FILE.ply [--scene NAME]       pictures of any Gaussian splat; with a scene, measured on its test views
   rtgs cache ls|gc|verify|push|pull       the artifact store, and the one that machines share
   rtgs weights                            pretrained files: what is known, what is there; downloads nothing
   rtgs dashboard                          MLflow's pages on this machine
@@ -248,11 +249,19 @@ def _root() -> Path:
     return Path(os.environ.get("RTGS_ROOT", "."))
 
 
+def show(words: list[str]) -> int:
+    """``rtgs show``: any splat as pictures, and measured."""
+    from pipelines.show import show as command
+
+    return command(words)
+
+
 COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "run": run,
     "plan": plan,
     "cache": cache,
     "check": check,
+    "show": show,
     "weights": weights,
     "report": report,
     "dashboard": dashboard,

@@ -29,7 +29,7 @@ under the mouse. With --scene, also the test views of that capture, and their PS
 
 def show(words: list[str]) -> int:
     """The command; returns the exit code."""
-    options = _parser().parse_args(words)
+    options = _parser().parse_intermixed_args(words)
     if options.settings and options.scene is None:
         raise RtgsError(f"{options.settings[0]}: settings of a scene need --scene")
     from rtgs.gaussians.ply import read_gaussians

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from rtgs.errors import RtgsError
 from rtgs.gaussians.ellipsoids import Ellipsoids
+from rtgs.gaussians.harmonics import rgb_to_sh_dc
 from rtgs.gaussians.primitives import Gaussians, tangents
 from rtgs.gaussians.surfels import Surfels
 
@@ -136,12 +137,16 @@ def _gaussians_of(path: Path, vertices: plyfile.PlyElement, names: list[str]) ->
     if "scale_2" in names and bool((~(columns("scale_2") <= THICKEST_LOG_SCALE)).any()):
         kind = Ellipsoids
     rest = columns(*_numbered("f_rest", rest_count)).reshape(vertices.count, 3, rest_count // 3)
+    if not rest_count and "f_dc_0" not in names and {"red", "green", "blue", "scale_0"} <= set(names):
+        sh_dc = rgb_to_sh_dc(columns("red", "green", "blue") / 255)  # nerfstudio's export with ply_color_mode=rgb
+    else:
+        sh_dc = columns(*_numbered("f_dc", 3))
     return kind(
         means=columns("x", "y", "z"),
         log_scales=columns(*_numbered("scale", kind.axis_count)),
         quaternions=columns(*_numbered("rot", 4)),
         opacity_logits=columns("opacity").flatten(),
-        sh_dc=columns(*_numbered("f_dc", 3)),
+        sh_dc=sh_dc,
         sh_rest=rest.transpose(1, 2).contiguous(),
     )
 

@@ -13,6 +13,7 @@ from rtgs.cameras import Camera
 from rtgs.gaussians.primitives import Gaussians
 
 BULK = (0.02, 0.98)  # quantiles of each coordinate, weighted by opacity, between which the bulk of a model lies
+MARGIN = 1.25  # the sphere an orbit is fitted to, in units of that of the centres: Gaussians reach further
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ def orbit_of_gaussians(gaussians: Gaussians, up: Tensor, picture: Picture, eleva
     target = box.mean(dim=0)
     reach = float(weighted_quantile((means - target).norm(dim=1), weight, BULK[1]))
     short = 2 * math.atan(math.tan(math.radians(picture.fov) / 2) * _short_share(picture))
-    radius = max(reach, 1e-6) / math.sin(short / 2)
+    radius = MARGIN * max(reach, 1e-6) / math.sin(short / 2)
     return Orbit(target, radius, _unit(up), elevation)
 
 
