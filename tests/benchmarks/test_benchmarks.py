@@ -11,7 +11,18 @@ from typing import Any
 
 import pytest
 
-from benchmarks import gaussians, losses, raster, sfm, speed_error, trace, trace_levers, trace_scene, train_step
+from benchmarks import (
+    captures,
+    gaussians,
+    losses,
+    raster,
+    sfm,
+    speed_error,
+    trace,
+    trace_levers,
+    trace_scene,
+    train_step,
+)
 from rtgs.native import core
 
 
@@ -91,6 +102,25 @@ def test_train_step(run) -> None:
     assert figures["step_over_raster"] > 0
     assert all(figures[f"{part}_ms"] > 0 for part in parts)
     assert math.isclose(sum(figures[f"share_{part}"] for part in (*parts, "rest")), 1, abs_tol=0.01)
+
+
+def test_captures(run, tmp_path: Path) -> None:
+    words = ["--preset", "smoke", "--scenes", "demo", "--methods", "3dgs", "2dgs+no_methods", "--root", str(tmp_path)]
+    figures = run(captures, *words, "--set", "schedule.total=12", "scene.long_side=48")
+    assert [entry["method"] for entry in figures["figures"]] == ["3dgs"]
+    assert figures["figures"][0]["runs"][0]["psnr"] > 5
+    assert figures["failures"][0].startswith("demo, 2dgs+no_methods, seed 0: ")
+    text = (tmp_path / "captures-smoke.md").read_text(encoding="utf-8")
+    assert "| demo | 3dgs | 48x36 | " in text
+    assert "- failed: demo, 2dgs+no_methods, seed 0: " in text
+
+
+def test_captures_gives_the_spread_over_seeds() -> None:
+    runs = [captures.Measured(20.0 + k, 0.5, 10.0, 5.0, 100.0 + k, 1000 * k, "48x36", 2) for k in range(3)]
+    cells = dict(zip(captures.COLUMNS, captures.row("demo", "3dgs", runs)))
+    assert cells["PSNR"] == "21.00 +- 1.00"
+    assert (cells["peak MB"], cells["Gaussians"], cells["seeds"]) == ("102", "1,000", "3")
+    assert captures.row("demo", "3dgs", runs[:1])[4] == "20.00"
 
 
 def test_losses(run, monkeypatch: pytest.MonkeyPatch) -> None:
