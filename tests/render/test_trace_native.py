@@ -208,6 +208,26 @@ def test_a_surfel_that_is_not_finite_changes_nothing(isa: str, bad: float, name:
         assert torch.equal(a, b), label
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_any_finite_input_gives_finite_results(isa: str, seed: int):
+    """A share of all values, those of the rays included, becomes +-1e-30 to 1e30."""
+    generator = torch.Generator().manual_seed(seed)
+    scene = native_trace_scene(80, 200, seed=seed, size=0.5)
+
+    def wild(tensor: Tensor) -> Tensor:
+        chosen = torch.rand(tensor.shape, generator=generator) < 0.05
+        extreme = 10.0 ** (60 * torch.rand(tensor.shape, generator=generator) - 30)
+        return torch.where(chosen, extreme * tensor.sign(), tensor)
+
+    kept = ("opacities", "probe")  # an opacity is at most 1
+    changed = {name: wild(tensor) for name, tensor in scene.items() if name not in kept}
+    found = everything(replace(scene, **changed))
+    for label, tensor in zip(LABELS, found, strict=True):
+        assert not tensor.isnan().any(), label
+        assert label in OUTPUTS or tensor.isfinite().all(), label
+    assert found[2].any()
+
+
 def test_bits_do_not_depend_on_earlier_calls(isa: str):
     small, large = native_trace_scene(50, 33), native_trace_scene(900, 1500, 20, seed=1, size=0.4)
     core.release_trace_memory()
