@@ -27,6 +27,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -41,24 +42,37 @@ ALL_OUTPUTS = RasterOptions(depth=True, median_depth=True, normal=True, distorti
 Stage = Callable[[], object]
 
 
+def scene_inputs(arrays: dict[str, np.ndarray], channels: int) -> list[np.ndarray]:
+    """Means, tangents, scales, opacities and the first features, as the native core takes them."""
+    inputs = [arrays[name] for name in ("pos", "tu", "tv", "sc", "op", "col")]
+    inputs[5] = np.ascontiguousarray(inputs[5][:, :channels])
+    return inputs
+
+
+def yardstick_view() -> tuple[np.ndarray, np.ndarray, float, float, float, float, int, int]:
+    """Arguments of a core.RasterCamera, but for near and far."""
+    focal = 0.9 * WIDTH
+    return np.eye(3), np.zeros(3), focal, focal, WIDTH / 2 + 0.3, HEIGHT / 2 - 0.2, WIDTH, HEIGHT
+
+
 class Ours:
     """One scene through the native core, stage by stage, with the arrays that rasterize_surfels would allocate."""
 
-    def __init__(self, arrays: dict[str, np.ndarray], options: RasterOptions, threads: int = 1) -> None:
-        self.inputs = [arrays[name] for name in ("pos", "tu", "tv", "sc", "op", "col")]
+    def __init__(
+        self, arrays: dict[str, np.ndarray], options: RasterOptions, threads: int = 1, channels: int = CHANNELS
+    ) -> None:
+        self.inputs = scene_inputs(arrays, channels)
         self.options, self.threads = options, threads
         self.native: core.Rasterization | None = None
         rng = np.random.default_rng(1)
         size, count = (HEIGHT, WIDTH), len(arrays["pos"])
         has_depth = options.depth or options.median_depth or options.distortion
-        focal = 0.9 * WIDTH
-        camera = (np.eye(3), np.zeros(3), focal, focal, WIDTH / 2 + 0.3, HEIGHT / 2 - 0.2, WIDTH, HEIGHT)
-        self.arguments = (core.RasterCamera(*camera, options.near, options.far), options.normal, has_depth)
+        self.arguments = (core.RasterCamera(*yardstick_view(), options.near, options.far), options.normal, has_depth)
 
         def picture(wanted: bool, *lead: int) -> np.ndarray | None:
             return np.empty((*lead, *size), np.float32) if wanted else None
 
-        self.image, self.alpha, self.normal = picture(True, CHANNELS), picture(True), picture(options.normal, 3)
+        self.image, self.alpha, self.normal = picture(True, channels), picture(True), picture(options.normal, 3)
         self.depth, self.median = picture(options.depth), picture(options.median_depth)
         self.distortion = picture(options.distortion)
         self.weight_sum = np.empty(count, np.float32) if options.weight_sum else None
@@ -155,10 +169,17 @@ def case_figures(count: int, prototype: tuple[ModuleType, Path] | None, repeat: 
     return figures
 
 
-def thread_figures(count: int, repeat: int) -> dict[str, float]:
+class Staged(Protocol):
+    """One scene through the native core, stage by stage."""
+
+    def project(self) -> None: ...
+    def forward(self) -> None: ...
+    def backward(self) -> None: ...
+
+
+def thread_figures(of_threads: Callable[[int], Staged], repeat: int) -> dict[str, float]:
     """Speed-up of forward + backward from one to two threads, by CPU time and by the wall."""
-    arrays = shared_arrays(count) or made_arrays(count, SCALES[count])
-    runs = {threads: Ours(arrays, RasterOptions(), threads) for threads in (1, 2)}
+    runs = {threads: of_threads(threads) for threads in (1, 2)}
     busiest: dict[int, list[float]] = {1: [], 2: []}
     wall: dict[int, list[float]] = {1: [], 2: []}
     for round_number in range(repeat + 2):
@@ -188,7 +209,9 @@ def main() -> None:
         prototype = load_prototype(Path(folder))
         for count in arguments.counts:
             figures |= case_figures(count, prototype, arguments.repeat)
-    figures |= thread_figures(max(arguments.counts), arguments.repeat)
+    count = max(arguments.counts)
+    arrays = shared_arrays(count) or made_arrays(count, SCALES[count])
+    figures |= thread_figures(lambda threads: Ours(arrays, RasterOptions(), threads), arguments.repeat)
     figures["peak_memory_mb"] = round(peak_memory_mb())
     for name, value in figures.items():
         print(name, value)
