@@ -38,6 +38,9 @@ void TileForward<Footprint, C, kExtras>::clear(const RasterCamera& camera, const
 
 template <class Footprint, int C, bool kExtras>
 void TileForward<Footprint, C, kExtras>::composite(const ForwardArgs& args, const Tile& tile) {
+  // Which blocks a Gaussian touches is found for a batch ahead, so that the loop over them branches on what is known.
+  constexpr int kBatch = 16;
+  using Gaussian = typename Footprint::Entry;
   constexpr int kChannels = Footprint::kChannels, kFloats = kChannels + C + (kExtras ? Footprint::kExtraFields : 0);
   const LaneOffsets offsets;
   const typename Footprint::ForwardFlags flags(args);
@@ -48,37 +51,44 @@ void TileForward<Footprint, C, kExtras>::composite(const ForwardArgs& args, cons
   const float* records = args.gaussians.records;
   const int64_t stride = args.gaussians.layout.record_stride;
   int64_t entry = 0, work = 0;
-  for (; entry < count && live; ++entry) {
-    if (entry + kPrefetchDistance < count) prefetch_row<kFloats>(records + stride * ids[entry + kPrefetchDistance]);
-    const float* record = records + stride * ids[entry];
-    typename Footprint::Entry gaussian(record, tile, offsets, args);
-    uint64_t blocks = gaussian.touched() & live, shown_blocks = 0;
-    gaussian.prepare();
-    vfloat weight = broadcast(0.f);
-    while (blocks) {
-      const int block = __builtin_ctzll(blocks);
-      blocks &= blocks - 1;
-      BlockSums<C>& state = sums[block];
-      const vfloat transmittance = state.transmittance;
-      const typename Footprint::Response r = gaussian.respond(block);
-      vmask shown = shows(r.exponent, gaussian.least_exponent(), transmittance);
-      if (!any(shown)) continue;
-      shown_blocks |= uint64_t(1) << block;
-      vfloat alpha = min(exp2_response(r.exponent), broadcast(kMaxAlpha));
-      vfloat w = where(shown, alpha * transmittance), after = transmittance - w;
-      state.transmittance = after;
-#pragma GCC unroll 36
-      for (int k = 0; k < C; ++k) state.channels[k] += w * record[kChannels + k];
-      if constexpr (kExtras) {
-        if (flags.any())
-          Footprint::add_extras(flags, r, record + kChannels + C, w, shown, transmittance, int(entry), extras[block]);
-        weight += w;
-      }
-      if (!any(ge(after, broadcast(kMinTransmittance)))) live &= ~(uint64_t(1) << block);
+  for (int64_t batch = 0; batch < count && live; batch = entry) {
+    uint64_t touched[kBatch];
+    const int64_t end = count < batch + kBatch ? count : batch + kBatch;
+    for (int64_t k = batch; k < end; ++k) {
+      if (k + kBatch < count) prefetch_row<kFloats>(records + stride * ids[k + kBatch]);
+      touched[k - batch] = Gaussian(records + stride * ids[k], tile, offsets, args).touched();
     }
-    masks[entry] = shown_blocks;
-    if (kExtras && weigh) args.entry_weights[start + entry] = shown_blocks ? sum(weight) : 0.f;
-    work += shown_blocks ? 3 + 2 * __builtin_popcountll(shown_blocks) : 0;
+    for (; entry < end && live; ++entry) {
+      uint64_t blocks = touched[entry - batch] & live, shown_blocks = 0;
+      const float* record = records + stride * ids[entry];
+      Gaussian gaussian(record, tile, offsets, args);
+      gaussian.prepare();
+      vfloat weight = broadcast(0.f);
+      while (blocks) {
+        const int block = __builtin_ctzll(blocks);
+        blocks &= blocks - 1;
+        BlockSums<C>& state = sums[block];
+        const vfloat transmittance = state.transmittance;
+        const typename Footprint::Response r = gaussian.respond(block);
+        vmask shown = shows(r.exponent, gaussian.least_exponent(), transmittance);
+        if (!any(shown)) continue;
+        shown_blocks |= uint64_t(1) << block;
+        vfloat alpha = min(exp2_response(r.exponent), broadcast(kMaxAlpha));
+        vfloat w = where(shown, alpha * transmittance), after = transmittance - w;
+        state.transmittance = after;
+#pragma GCC unroll 36
+        for (int k = 0; k < C; ++k) state.channels[k] += w * record[kChannels + k];
+        if constexpr (kExtras) {
+          if (flags.any())
+            Footprint::add_extras(flags, r, record + kChannels + C, w, shown, transmittance, int(entry), extras[block]);
+          weight += w;
+        }
+        if (!any(ge(after, broadcast(kMinTransmittance)))) live &= ~(uint64_t(1) << block);
+      }
+      masks[entry] = shown_blocks;
+      if (kExtras && weigh) args.entry_weights[start + entry] = shown_blocks ? sum(weight) : 0.f;
+      work += shown_blocks ? 3 + 2 * __builtin_popcountll(shown_blocks) : 0;
+    }
   }
   args.tiles.used[tile.index] = entry;
   args.tiles.work[tile.index] = work + 4 * kBlocks;
