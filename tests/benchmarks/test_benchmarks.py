@@ -16,6 +16,7 @@ from benchmarks import (
     gaussians,
     losses,
     raster,
+    raster_ellipsoids,
     sfm,
     speed_error,
     trace,
@@ -53,6 +54,15 @@ def test_raster(run) -> None:
     assert set(figures["ms_20k"]) == {"ours", "full"}
     assert all(figures[key] > 0 for key in ("cost_of_outputs_20k", "speedup_2_threads", "peak_memory_mb"))
     assert figures["machine"]["isa"] == core.isa()
+
+
+def test_raster_ellipsoids(run) -> None:
+    figures = run(raster_ellipsoids, "--repeat", "1", "--counts", "20000")
+    assert all(figures[f"ratio_{stage}_20k"] > 0 for stage in ("project", "forward", "backward"))
+    assert set(figures["ms_20k"]) == {"ellipsoids", "surfels"}
+    assert figures["speedup_2_threads"] > 0
+    assert figures["peak_memory_mb"] > 0
+    assert (figures["splat"], figures["splat_mgaussians_per_s"]) == ("absent", None)
 
 
 @pytest.fixture
