@@ -8,16 +8,26 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 
-from pipelines import evaluate, extract_mesh, import_scene, render, report, sfm, synthesize, train_diffuse
+from pipelines import (
+    evaluate,
+    extract_mesh,
+    import_scene,
+    render,
+    report,
+    sfm,
+    synthesize,
+    train_diffuse,
+    train_reflection,
+)
 from pipelines.preparation import SkippedStep, prepare
 from pipelines.training import StageParams
 from rtgs.config.schema import Choices, RunConfig
-from rtgs.methods import method_stages
+from rtgs.methods import method_stages, stage_settings
 from rtgs.pipeline import Step, StepKind
 from rtgs.pipeline.fingerprint import flatten
 from rtgs.train.settings import MethodSettings, ScheduleSettings
 
-TRAINING: Mapping[str, StepKind] = {"diffuse": train_diffuse.STEP}
+TRAINING: Mapping[str, StepKind] = {"diffuse": train_diffuse.STEP, "reflection": train_reflection.STEP}
 """The step that runs a stage, by the name the method gives it."""
 
 KINDS: tuple[StepKind, ...] = (
@@ -82,7 +92,8 @@ def _training(config: RunConfig, scene: Step) -> tuple[Step, ...]:
     method: MethodSettings = replace(config.method, paper_schedule=ScheduleSettings())  # a preset has read it by now
     steps: list[Step] = []
     for stage in method_stages(method, config.schedule):
-        params = StageParams(method, config.schedule, config.seed, stage.name, stage.from_step, stage.until)
+        own = stage_settings(method, stage.name)  # so that runs that differ elsewhere share the stage
+        params = StageParams(own, config.schedule, config.seed, stage.name, stage.from_step, stage.until)
         steps.append(TRAINING[stage.name].step(params, scene, *steps))
     return tuple(steps)
 

@@ -54,7 +54,7 @@ def render(params: RenderParams, context: StepContext) -> None:
             seconds[view.name] = time.perf_counter() - start
             tensors = {"image": image.contiguous()}
             if params.maps:
-                options = RenderOptions(depth=True, normal="normal" in method.maps)
+                options = RenderOptions(depth=True, normal="normal" in method.maps, layers=True)
                 tensors |= _maps(method.render(view.camera, stage.until, options))
         save_file(tensors, context.out / "views" / f"{stem}.safetensors")
         write_png(context.out / "images" / f"{stem}.png", to_bytes(image))
@@ -68,6 +68,8 @@ def _maps(rendered: RenderedView) -> dict[str, Tensor]:
     assert buffers.depth is not None
     depth = buffers.depth / buffers.alpha.clamp_min(1e-6)  # the buffer holds the sum of w z
     maps = {"depth": depth, "normal": buffers.normal, "alpha": buffers.alpha}
+    if rendered.layers is not None:
+        maps |= {name: tensor.float() for name, tensor in vars(rendered.layers).items()}
     return {name: tensor.contiguous() for name, tensor in maps.items() if tensor is not None}
 
 
@@ -91,10 +93,18 @@ def read_timed(folder: Path, view_name: str) -> TimedRender:
 
 STEP = StepKind(
     "render",
-    1,
+    2,
     render,
     helpers=(
         "pipelines.training",
+        "rtgs.methods.reflective",
+        "rtgs.methods.reflection_set",
+        "rtgs.methods.mirror",
+        "rtgs.methods.traced_pixels",
+        "rtgs.gaussians.materials",
+        "rtgs.optics.microfacet",
+        "rtgs.optics.split_sum",
+        "rtgs.render.trace",
         "rtgs.methods.surfel_base",
         "rtgs.methods.gs3d",
         "rtgs.render.rasterize",

@@ -45,11 +45,10 @@ def train_stage(params: StageParams, context: StepContext) -> None:
     and ``history.jsonl`` (the recorded metrics).
 
     Raises:
-        RtgsError: the method does not have this stage.
         TrainingDiverged: a loss or gradient is not finite.
     """
     from rtgs.gaussians.ply import write_ply
-    from rtgs.methods import create_method
+    from rtgs.methods import Stage, create_method
     from rtgs.scenes.canonical import read_scene
     from rtgs.train.progress import progress_for
     from rtgs.train.seeds import generator_for
@@ -57,9 +56,7 @@ def train_stage(params: StageParams, context: StepContext) -> None:
 
     scene = read_scene(context.inputs["import_scene"])
     method = create_method(params.method, scene, params.schedule, generator_for(params.seed, "initialise"))
-    stage = next((stage for stage in method.stages if stage.name == params.stage), None)
-    if stage is None:
-        raise RtgsError(f"method {params.method.name} has no stage {params.stage!r}")
+    stage = Stage(params.stage, params.from_step, params.until)
     checkpoints = context.partial / "checkpoints"
     _start_from_stage_before(context, checkpoints)
     recorder = HistoryRecorder(context.partial / HISTORY_FILE, context.tracker)

@@ -42,6 +42,16 @@ def activate_surfels(surfels: Gaussians, camera_center: Tensor, sh_degree: int) 
     return ActivatedSurfels(surfels.means, *outputs)
 
 
+def activate_geometry(surfels: Gaussians) -> ActivatedSurfels:
+    """Tangents, scales and opacities alone, differentiable; the colours of the result mean nothing.
+
+    For the tracer, which evaluates colours itself, at the direction of each ray.
+    """
+    raw = [getattr(surfels, field.name) for field in fields(Gaussians)]
+    raw[4], raw[5] = raw[4].detach(), raw[5].detach()
+    return ActivatedSurfels(surfels.means, *_Activate.apply((0.0, 0.0, 0.0), 0, *raw))
+
+
 def arrays(tensors: tuple[Tensor, ...]) -> tuple:
     """Contiguous numpy views for a native call."""
     return tuple(tensor.detach().contiguous().numpy() for tensor in tensors)

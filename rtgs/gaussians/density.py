@@ -116,7 +116,7 @@ class DensityControl:
         """Record one step, after its backward pass.
 
         Args:
-            signal: (N, 2) densification signal, NDC units (docs/rasterizer.md).
+            signal: (N, 2) densification signal, NDC units (docs/rasterizer.md); (N, 3) of the tracer (docs/tracer.md).
             weight_sum: (N,) sum of blending weights over the pixels of the view.
 
         Raises:
@@ -124,9 +124,10 @@ class DensityControl:
             FloatingPointError: a value is NaN or inf.
         """
         count = len(signal)
-        if signal.shape != (count, 2) or weight_sum.shape != (count,):
+        if signal.shape not in ((count, 2), (count, 3)) or weight_sum.shape != (count,):
             raise ValueError(
-                f"signal must be (N, 2) and weight_sum (N,), got {tuple(signal.shape)} and {tuple(weight_sum.shape)}"
+                f"signal must be (N, 2) or (N, 3) and weight_sum (N,), got {tuple(signal.shape)} and "
+                f"{tuple(weight_sum.shape)}"
             )
         if not len(self.visible_steps):
             self._clear(count)
@@ -135,7 +136,7 @@ class DensityControl:
                 f"{count} surfels observed, but the statistics are of {len(self.visible_steps)}; "
                 "change N through rtgs.gaussians.density.apply_plan"
             )
-        norm = torch.hypot(*signal.detach().unbind(1))
+        norm = torch.hypot(*signal.detach().unbind(1)) if signal.shape[1] == 2 else signal.detach().norm(dim=1)
         weight = weight_sum.detach()
         either = norm + weight  # both are >= 0
         if not math.isfinite(float(either.sum())):

@@ -4,6 +4,7 @@ Float32 vertex properties: x y z nx ny nz f_dc_0..2 f_rest_0..3K-1 opacity scale
 are raw (logit of opacity, log of scales, quaternion w x y z of any length); f_rest is channel-major: all
 coefficients of red, then green, then blue. Of other tools' files the same names are read, in any order, whatever else
 they hold; PlayCanvas' compressed files are read with ``gsply``.
+Surfels with materials have specular roughness f0_0.. besides, raw too; viewers ignore them.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from torch import Tensor
 from rtgs.errors import RtgsError
 from rtgs.gaussians.ellipsoids import Ellipsoids
 from rtgs.gaussians.harmonics import rgb_to_sh_dc
+from rtgs.gaussians.materials import MaterialSurfels
 from rtgs.gaussians.primitives import Gaussians, tangents
 from rtgs.gaussians.surfels import Surfels
 
@@ -60,6 +62,9 @@ def write_ply(path: str | Path, surfels: Gaussians, third_scale: bool = True) ->
     if flat and third_scale:
         columns["scale_2"] = torch.full((len(surfels),), THIRD_LOG_SCALE)
     _add(columns, _numbered("rot", 4), values["quaternions"])
+    if isinstance(surfels, MaterialSurfels):
+        columns["specular"], columns["roughness"] = values["specular_logits"], values["roughness_logits"]
+        _add(columns, _numbered("f0", values["f0_logits"].shape[1]), values["f0_logits"])
 
     vertices = np.empty(len(surfels), dtype=[(name, "<f4") for name in columns])
     for name, column in columns.items():
@@ -100,7 +105,7 @@ def read_gaussians(path: str | Path, *, skip_broken: bool = False) -> Surfels | 
 
     Returns:
         Surfels where there is no third scale, or all third scales are below exp(-10) world units; else ellipsoids.
-        Float32, without gradient.
+        Float32, without gradient. :class:`MaterialSurfels` where the file has materials.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -141,13 +146,22 @@ def _gaussians_of(path: Path, vertices: plyfile.PlyElement, names: list[str]) ->
         sh_dc = rgb_to_sh_dc(columns("red", "green", "blue") / 255)  # nerfstudio's export with ply_color_mode=rgb
     else:
         sh_dc = columns(*_numbered("f_dc", 3))
-    return kind(
+    gaussians = kind(
         means=columns("x", "y", "z"),
         log_scales=columns(*_numbered("scale", kind.axis_count)),
         quaternions=columns(*_numbered("rot", 4)),
         opacity_logits=columns("opacity").flatten(),
         sh_dc=sh_dc,
         sh_rest=rest.transpose(1, 2).contiguous(),
+    )
+    if "specular" not in names or not isinstance(gaussians, Surfels):
+        return gaussians
+    channels = sum(name.startswith("f0_") for name in names)
+    return MaterialSurfels(
+        **dict(gaussians.items()),
+        specular_logits=columns("specular").flatten(),
+        roughness_logits=columns("roughness").flatten(),
+        f0_logits=columns(*_numbered("f0", channels)),
     )
 
 

@@ -13,16 +13,18 @@ from rtgs.methods.base import (
     Method,
     RenderedView,
     RenderOptions,
+    SpecularLayers,
     Stage,
     StepEvent,
 )
+from rtgs.methods.stages import stage_settings
 from rtgs.train.settings import MethodSettings, ScheduleSettings
 
 if TYPE_CHECKING:
     from rtgs.methods.surfel_base import SurfelMethod
     from rtgs.scenes.scene import Scene
 
-METHOD_NAMES = ("2dgs", "3dgs", "rtgs")
+METHOD_NAMES = ("2dgs", "3dgs", "envgs", "rtgs")
 
 
 def create_method(
@@ -45,7 +47,7 @@ def method_stages(settings: MethodSettings, schedule: ScheduleSettings) -> tuple
     Raises:
         ValueError: no method has this name.
     """
-    return _method_class(settings).declare_stages(schedule)
+    return _method_class(settings).declare_stages(settings, schedule)
 
 
 def _method_class(settings: MethodSettings) -> type[SurfelMethod]:
@@ -57,6 +59,10 @@ def _method_class(settings: MethodSettings) -> type[SurfelMethod]:
         from rtgs.methods.gs3d import Gs3d
 
         return Gs3d
+    if settings.name == "envgs":
+        from rtgs.methods.envgs import EnvGs
+
+        return EnvGs
     if settings.name == "rtgs":
         from rtgs.methods.rtgs import RtGs
 
@@ -72,8 +78,10 @@ __all__ = [
     "Method",
     "RenderOptions",
     "RenderedView",
+    "SpecularLayers",
     "Stage",
     "StepEvent",
     "create_method",
     "method_stages",
+    "stage_settings",
 ]

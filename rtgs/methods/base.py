@@ -41,6 +41,20 @@ class RenderOptions:
     median_depth: bool = False
     normal: bool = False
     distortion: bool = False
+    layers: bool = False  # what reflection adds, of methods that have it
+
+
+@dataclass(frozen=True)
+class SpecularLayers:
+    """What a view with reflection is made of: image = diffuse part (1 - k_s) C_d + reflection."""
+
+    diffuse: Tensor  # (3, H, W) C_d
+    reflection: Tensor  # (3, H, W) k_s w_r C_r; 0 where no ray was traced
+    reflected_color: Tensor  # (3, H, W) C_r; 0 where no ray was traced
+    specular: Tensor  # (H, W) k_s as composited
+    roughness: Tensor  # (H, W) in 0..1
+    f0: Tensor  # (H, W), or (3, H, W) for rgb
+    traced: Tensor  # (H, W) bool
 
 
 @dataclass(frozen=True)
@@ -50,6 +64,8 @@ class RenderedView:
     camera: Camera
     image: Tensor  # (3, H, W) sRGB, not clamped
     buffers: RasterBuffers  # of the base set; maps that were not asked for are None
+    layers: SpecularLayers | None = None  # of methods with reflection, when asked for
+    specular: Tensor | None = None  # (H, W) k_s as composited, with its graph
 
 
 @dataclass(frozen=True)
@@ -68,12 +84,17 @@ class LossTerms:
     total: Tensor  # scalar with its graph: the weighted sum of the terms
     terms: tuple[LossTerm, ...]
 
+    def plus(self, name: str, value: Tensor, weight: float) -> LossTerms:
+        """With one more term: ``value`` (scalar, unweighted, with its graph)."""
+        term = LossTerm(name, float(value.detach()), weight)
+        return LossTerms(self.total + weight * value, (*self.terms, term))
+
 
 @dataclass(frozen=True)
 class StepEvent:
     """A change of a set between two steps worth a line in the log: density control, an opacity reset."""
 
-    kind: str  # "density" or "opacity_reset"
+    kind: str  # "density", "opacity_reset", "propagation", "begin" or "decision"
     set_name: str
     detail: str
 
@@ -94,6 +115,10 @@ class Method(Protocol):
     @property
     def sets(self) -> tuple[SurfelSet, ...]:
         """The sets of surfels in training, each with its optimiser and density control."""
+        ...
+
+    def begin(self, stage: Stage) -> tuple[StepEvent, ...]:
+        """Called once when a stage starts afresh (not when it goes on from a checkpoint of its own)."""
         ...
 
     def render(self, camera: Camera, step: int, options: RenderOptions | None = None) -> RenderedView:

@@ -1,9 +1,9 @@
-"""RT-GS, first stage: the diffuse base set, trained with EnvGS's numbers (methods.md 6.1, 6.2)."""
+"""RT-GS to its second stage: the diffuse base set, then reflection with the microfacet weight (methods.md 6.2)."""
 
 from __future__ import annotations
 
-from rtgs.methods.surfel_base import SurfelMethod
+from rtgs.methods.reflective import ReflectiveMethod
 
 
-class RtGs(SurfelMethod):
-    """RT-GS up to the point where reflection starts: base set only; losses rgb, normal and monocular normal."""
+class RtGs(ReflectiveMethod):
+    """RT-GS up to the point where transmittance starts; its numbers are in conf/method/rtgs."""

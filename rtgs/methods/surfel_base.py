@@ -82,14 +82,14 @@ class SurfelMethod:
             means_lr_steps=schedule.means_lr_steps,
             extent=scene.extent,
         )
-        self.stages = self.declare_stages(schedule)
+        self.stages = self.declare_stages(settings, schedule)
         self.starts, decisions = _decide_losses(settings, scene, schedule)
         self.decisions: tuple[Decision, ...] = (*decisions, *_decide_density(settings, schedule))
         self._background = torch.tensor(settings.render.background)
 
     @staticmethod
-    def declare_stages(schedule: ScheduleSettings) -> tuple[Stage, ...]:
-        """The stages of a run with this schedule, known before any scene is: one pipeline step each."""
+    def declare_stages(settings: MethodSettings, schedule: ScheduleSettings) -> tuple[Stage, ...]:
+        """The stages of a run with these settings, known before any scene is: one pipeline step each."""
         return (Stage("diffuse", 0, schedule.total),)
 
     @property
@@ -99,6 +99,10 @@ class SurfelMethod:
     def sh_degree(self, step: int) -> int:
         """SH degree in use at ``step``."""
         return sh_degree_at(self.schedule, step, self.base.surfels.sh_degree)
+
+    def begin(self, stage: Stage) -> tuple[StepEvent, ...]:
+        """Nothing to prepare: the base set is there from the start."""
+        return ()
 
     def training_options(self, step: int) -> RenderOptions:
         """The maps that the losses of this step need, and no others."""
@@ -122,15 +126,16 @@ class SurfelMethod:
         wanted = self.training_options(step) if options is None else options
         surfels = self.base.activated(camera.center.float(), self.sh_degree(step))
         probe = self.base.new_probe() if watched else None
+        features = self.base_features(surfels.colors)
         buffers = rasterize_surfels(
             surfels.means,
             surfels.tangent_u,
             surfels.tangent_v,
             surfels.scales,
             surfels.opacities,
-            surfels.colors,
+            features,
             camera,
-            background=self._background,
+            background=torch.nn.functional.pad(self._background, (0, features.shape[1] - 3)),
             options=self.raster_options(wanted, weight_sum=watched),
             screen_probe=probe,
         )
@@ -141,6 +146,10 @@ class SurfelMethod:
     def watched(self, step: int, options: RenderOptions | None) -> bool:
         """Whether density control learns from a view rendered with these options at this step."""
         return options is None and self.base.density.needs_signal and densify_ahead(self.schedule, step)
+
+    def base_features(self, colors: Tensor) -> Tensor:
+        """(N, C) what is composited of the base set: the SH colours (N, 3) first."""
+        return colors
 
     def raster_options(self, wanted: RenderOptions, *, weight_sum: bool) -> RasterOptions:
         """The rasteriser's options: near and far in world units of this scene."""
@@ -216,21 +225,31 @@ class SurfelMethod:
         following = step + 1
         events = []
         if densify_due(self.schedule, following):
-            report = self.base.densify(self.generator, after_reset=opacity_was_reset(self.schedule, following))
-            if report.total == 0:
-                raise RtgsError(
-                    f"density control removed all {report.pruned} surfels of set {self.base.name!r} before step "
-                    f"{following}: every opacity was below method.density.min_opacity "
-                    f"{self.settings.density.min_opacity}. Lower it, or the learning rate "
-                    "method.optimizer.opacity_logits; the last checkpoint is intact"
-                )
-            detail = f"{report.cloned} cloned, {report.split} split, {report.pruned} pruned, {report.total} surfels"
-            events.append(StepEvent("density", self.base.name, detail))
+            events.append(self.densify(self.base, self.settings.density.min_opacity, following))
         if self.base.density.resets_opacity and opacity_reset_due(self.schedule, following):
-            self.base.reset_opacity()
-            detail = f"opacities lowered to {self.settings.density.reset_opacity}"
-            events.append(StepEvent("opacity_reset", self.base.name, detail))
+            events.append(self.reset_opacity(self.base, self.settings.density.reset_opacity))
         return tuple(events)
+
+    def densify(self, part: SurfelSet, min_opacity: float, following: int) -> StepEvent:
+        """Density control of one set before step ``following``.
+
+        Raises:
+            RtgsError: it left no surfel.
+        """
+        report = part.densify(self.generator, after_reset=opacity_was_reset(self.schedule, following))
+        if report.total == 0:
+            raise RtgsError(
+                f"density control removed all {report.pruned} surfels of set {part.name!r} before step {following}: "
+                f"every opacity was below method.density.min_opacity {min_opacity}. Lower it, or the learning rate "
+                "method.optimizer.opacity_logits; the last checkpoint is intact"
+            )
+        detail = f"{report.cloned} cloned, {report.split} split, {report.pruned} pruned, {report.total} surfels"
+        return StepEvent("density", part.name, detail)
+
+    def reset_opacity(self, part: SurfelSet, opacity: float) -> StepEvent:
+        """Opacity reset of one set."""
+        part.reset_opacity()
+        return StepEvent("opacity_reset", part.name, f"opacities lowered to {opacity}")
 
     def state(self) -> dict[str, Tensor]:
         """Flat mapping of every tensor that training needs to go on, generator included."""

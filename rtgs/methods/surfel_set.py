@@ -21,7 +21,7 @@ from rtgs.train.settings import DensitySettings, OptimizerSettings
 class Observation:
     """What density control learns from one rendered training view."""
 
-    probe: Tensor  # (N, 2); after the backward pass its gradient is the densification signal
+    probe: Tensor  # (N, 2 or 3); after the backward pass its gradient is the densification signal
     weight_sum: Tensor  # (N,)
 
 
@@ -60,18 +60,27 @@ class SurfelSet:
         """Activated surfels as seen from ``camera_center`` (3,) world, SH up to ``sh_degree``."""
         return activate_surfels(self.surfels, camera_center, sh_degree)
 
-    def new_probe(self) -> Tensor:
-        """A (N, 2) zero tensor to hand to the renderer of a training view."""
-        return torch.zeros(len(self), 2, requires_grad=True)
+    def adopt(self, surfels: Gaussians) -> None:
+        """Go on with the same rows and more or fewer kinds of parameters; Adam keeps the moments of those that stay."""
+        if len(surfels) != len(self):
+            raise ValueError(f"set {self.name!r} has {len(self)} rows, {len(surfels)} were given; use apply_plan")
+        before = self.optimizer
+        self.surfels = surfels.requires_grad_()
+        self.optimizer = self._new_optimizer()
+        self.optimizer.inherit(before)
+
+    def new_probe(self, columns: int = 2) -> Tensor:
+        """A (N, columns) zero tensor to hand to the renderer of a training view: 2 of a rasteriser, 3 of the tracer."""
+        return torch.zeros(len(self), columns, requires_grad=True)
 
     def watch(self, probe: Tensor, weight_sum: Tensor) -> None:
         """Remember what the renderer of this step's view returned, until :meth:`step`."""
         self._observation = Observation(probe, weight_sum)
 
-    def step(self, step: int, sh_degree: int) -> None:
+    def step(self, step: int, sh_degree: int, *, held: tuple[str, ...] = ()) -> None:
         """Hand the view's signal to density control, then one step of Adam and the clamps that keep values finite.
 
-        ``sh_degree`` is the degree that :meth:`activated` used in this step.
+        ``sh_degree`` is the degree that :meth:`activated` used in this step; parameters named in ``held`` stand still.
 
         Raises:
             NonFiniteGradientError: a gradient held NaN or inf; gradients are kept for the report.
@@ -79,6 +88,8 @@ class SurfelSet:
         if self._observation is not None and self._observation.probe.grad is not None:
             self.density.observe(self._observation.probe.grad, self._observation.weight_sum)
         self._observation = None
+        for name in held:
+            getattr(self.surfels, name).grad = None  # Adam leaves a parameter without one alone
         self.optimizer.step(step, sh_degree)
         self.optimizer.zero_grad()
         self._clamp()
@@ -108,7 +119,9 @@ class SurfelSet:
         limits = self._optimizer_settings
         smallest, largest = (math.log(share * self.extent) for share in (limits.smallest_scale, limits.largest_scale))
         self.surfels.log_scales.clamp_(smallest, largest)
-        self.surfels.opacity_logits.clamp_(-limits.opacity_logit_limit, limits.opacity_logit_limit)
+        for name, values in self.surfels.items():
+            if name.endswith("_logits"):
+                values.clamp_(-limits.opacity_logit_limit, limits.opacity_logit_limit)
 
     def state(self) -> dict[str, Tensor]:
         """Every tensor of the set under dotted names."""

@@ -150,6 +150,14 @@ class SurfelAdam:
             for name, values in moments.items():
                 setattr(moments, name, torch.cat((values, values.new_zeros(count, *values.shape[1:]))))
 
+    def inherit(self, other: SurfelAdam) -> None:
+        """Go on where the optimiser of the same rows stopped: its step count, and moments of parameters in both."""
+        self.steps, self.sh_degree = other.steps, other.sh_degree
+        for mine, theirs in ((self.first, other.first), (self.second, other.second)):
+            for name, _ in mine.items():
+                if hasattr(theirs, name):
+                    setattr(mine, name, getattr(theirs, name))
+
     def zero_moments(self, name: str, rows: Tensor | None = None) -> None:
         """Forget one parameter's moments: of all surfels, or of ``rows`` (int64 or bool)."""
         for moments in (self.first, self.second):

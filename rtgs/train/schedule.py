@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from rtgs.train.settings import ScheduleSettings
+from rtgs.train.settings import ReflectionSettings, ScheduleSettings
 
 
 def check_schedule(schedule: ScheduleSettings) -> None:
@@ -64,6 +64,65 @@ def opacity_was_reset(schedule: ScheduleSettings, step: int) -> bool:
 def loss_start(share: float, total: int) -> int:
     """First step of a loss term that starts after ``share`` of a run of ``total`` steps."""
     return round(share * total)
+
+
+@dataclass(frozen=True)
+class ReflectionPlan:
+    """When the second stage does what, in steps of this run (methods.md 6.1, 6.2)."""
+
+    start: int  # first step with reflection
+    judged: int  # before this step the scene is judged: matte or not; ``start``: it never is
+    propagation_until: int  # last step before which normals are propagated
+    base: ScheduleSettings  # of the base set's density control during the stage
+    reflection: ScheduleSettings  # of the reflection set: SH degree, density control, resets
+
+
+def reflection_plan(settings: ReflectionSettings, schedule: ScheduleSettings) -> ReflectionPlan:
+    """The second stage's shares as steps of a run of ``schedule.total`` steps."""
+    total = schedule.total
+    start = round(settings.start * total)
+    reflection = replace(
+        schedule,
+        sh_from=start,
+        sh_every=settings.sh_every,
+        densify_from=start,
+        densify_until=round(settings.densify_until * total),
+        densify_every=settings.densify_every,
+        opacity_reset_every=settings.opacity_reset_every,
+    )
+    probation = settings.matte.probation
+    judged = start + max(1, round(probation * total)) if probation > 0 else start
+    return ReflectionPlan(start, judged, round(settings.propagation.until * total), schedule, reflection)
+
+
+def propagation_due(plan: ReflectionPlan, settings: ReflectionSettings, step: int) -> bool:
+    """Whether normals are propagated before ``step``: not before the scene is judged, not at a reset of either set."""
+    every = settings.propagation.every
+    if not (every > 0 and step % every == 0 and plan.judged < step <= plan.propagation_until):
+        return False
+    return not (opacity_reset_due(plan.base, step) or reflection_reset_due(plan, step))
+
+
+def reflection_reset_due(plan: ReflectionPlan, step: int) -> bool:
+    """Whether the reflection set's opacities are reset before ``step``; never before the scene is judged."""
+    return step > plan.judged and opacity_reset_due(plan.reflection, step)
+
+
+def opacities_held(plan: ReflectionPlan, settings: ReflectionSettings, step: int) -> bool:
+    """Whether the base set's opacities stand still in ``step``: from a propagation to the next multiple of the hold."""
+    every, hold = settings.propagation.every, settings.propagation.hold_every
+    if every == 0:
+        return False
+    last = step // every * every
+    return propagation_due(plan, settings, last) and step // hold == last // hold
+
+
+def base_densify_due(plan: ReflectionPlan, settings: ReflectionSettings, step: int) -> bool:
+    """Density control of the base set: rarer while normals are propagated (EnvGS)."""
+    if settings.propagation.every > 0 and plan.start < step <= plan.propagation_until:
+        every = max(settings.propagation.densify_every, plan.base.densify_every)
+        return densify_due(replace(plan.base, densify_every=every), step)
+    return densify_due(plan.base, step)
 
 
 @dataclass(frozen=True)

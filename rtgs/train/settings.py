@@ -5,20 +5,11 @@ Steps count from 0. A stage boundary "from" is the first step at which something
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 
-
-def _refuse_bad_numbers(settings: object, where: str) -> None:
-    """Every float of a settings object must be finite and not negative, every ``*_start`` a share."""
-    for entry in fields(settings):  # type: ignore[arg-type]
-        value = getattr(settings, entry.name)
-        if not isinstance(value, float):
-            continue
-        largest = 1.0 if entry.name.endswith("_start") else math.inf
-        if not (0 <= value <= largest and math.isfinite(value)):
-            allowed = "between 0 and 1" if largest == 1 else "a finite number of at least 0"
-            raise ValueError(f"{where}.{entry.name}={value} must be {allowed}")
+from rtgs.optics.settings import OpticsSettings
+from rtgs.train.refuse import refuse_bad_numbers, refuse_unless
+from rtgs.train.specular_settings import MaterialSettings, MatteSettings, PropagationSettings, TracedShareSettings
 
 
 @dataclass(frozen=True)
@@ -32,6 +23,9 @@ class OptimizerSettings:
     opacity_logits: float = 0.05
     log_scales: float = 5e-3
     quaternions: float = 1e-3
+    specular_logits: float = 0.01  # materials of the base set: EnvGS k_s 0.01; Ref-Gaussian 0.005 for the others
+    roughness_logits: float = 0.005
+    f0_logits: float = 0.005
     beta1: float = 0.9
     beta2: float = 0.999
     eps: float = 1e-15
@@ -41,7 +35,7 @@ class OptimizerSettings:
     largest_scale: float = 100.0  # times the scene extent
 
     def __post_init__(self) -> None:
-        _refuse_bad_numbers(self, "method.optimizer")
+        refuse_bad_numbers(self, "method.optimizer")
 
 
 @dataclass(frozen=True)
@@ -62,9 +56,21 @@ class LossSettings:
     mono_normal_form: str = "cosine"  # "cosine" (paper: 1 - n.N) or "envgs" (|difference|_1 + 1 - cos)
     distortion: float = 0.0  # 2DGS: 0 unbounded, 1000 bounded
     distortion_start: float = 0.1  # 2DGS: from 3,000 of 30,000
+    # Perceptual loss of the second stage, where the VGG weights are there (register row 20).
+    perceptual: float = 0.0  # RT-GS and EnvGS 0.01
+    perceptual_start: float = 0.35  # 21,000 of 60,000
+    perceptual_form: str = "lpips"  # LPIPS-VGG on [0, 1] images, as EnvGS; "vgg_l1": L1 of raw VGG features
+    perceptual_crop: int = 64  # side of the random crop it looks at: the whole image would dwarf the rest of a step
+    # L_spec, mean of mask * ReLU(target - k_s): where the scene has masks of transparent objects (register row 10).
+    specular: float = 0.0  # RT-GS 0.2, from its third stage on
+    specular_start: float = 1 / 3  # 20,000 of 60,000
+    specular_target: float = 0.9  # K_0: soft, the diffuse colour keeps a tenth
 
     def __post_init__(self) -> None:
-        _refuse_bad_numbers(self, "method.loss")
+        refuse_bad_numbers(self, "method.loss")
+        form = self.perceptual_form
+        refuse_unless(form in ("lpips", "vgg_l1"), "method.loss.perceptual_form", form, "lpips or vgg_l1")
+        refuse_unless(self.perceptual_crop >= 32, "method.loss.perceptual_crop", self.perceptual_crop, "at least 32")
 
 
 @dataclass(frozen=True)
@@ -88,7 +94,7 @@ class McmcSettings:
     scale_loss: float = 0.05
 
     def __post_init__(self) -> None:
-        _refuse_bad_numbers(self, "method.density.mcmc")
+        refuse_bad_numbers(self, "method.density.mcmc")
 
 
 DENSITY_STRATEGIES = ("adaptive", "mcmc")
@@ -167,7 +173,56 @@ class RenderSettings:
     antialiased: bool = False  # the dilated footprint keeps its weight (Mip-Splatting's 2D filter)
 
     def __post_init__(self) -> None:
-        _refuse_bad_numbers(self, "method.render")
+        refuse_bad_numbers(self, "method.render")
+
+
+def _reflection_density() -> DensitySettings:
+    return DensitySettings(gradient_threshold=1e-4, max_surfels=700_000)  # EnvGS; the signal is the tracer's
+
+
+@dataclass(frozen=True)
+class ReflectionSettings:
+    """The reflection set and its part of the schedule (methods.md 3.2, 6.1, 6.2).
+
+    Boundaries are shares of the run, so that they keep their sense when it shrinks; intervals are steps, because what
+    they wait for (views seen, recovery from a reset) takes as many steps in a short run as in a long one. Learning
+    rates are those of ``method.optimizer``, the same for both sets.
+    """
+
+    start: float = 0.05  # share of the run: 3,000 of 60,000
+    densify_until: float = 0.35  # 21,000 of 60,000
+    densify_every: int = 500
+    opacity_reset_every: int = 6_000  # 0 = never; only while densifying
+    sh_every: int = 1_000  # one degree more each, from the start of the stage
+    specular_reset: bool = True  # register row 25: at resets of the base set k_s becomes min(k_s, initial)
+    cells: int = 32  # per axis of the box: stratified random points (16 at 256x192: kernels.md)
+    per_cell: int = 5
+    box_half: float = 0.0  # half side of a cube around the origin; 0 = box of the points (EnvGS: 20 for two scenes)
+    offset: float = 1e-4  # of the mirror ray's start, times the extent (methods.md 6.3; EnvGS 0)
+    smallest_alpha: float = 1e-2  # pixels with less coverage have no surface to reflect at
+    rebuild_every: int = 100  # steps between new trees; in between the tree is refitted (kernels.md)
+    transmittance_cutoff: float = 1e-4
+    alpha_cutoff: float = 1 / 255
+    direction_gradient: str = "full"  # register row 24; "last_sh": what EnvGS's public tracer returns
+    propagation: PropagationSettings = field(default_factory=PropagationSettings)
+    traced: TracedShareSettings = field(default_factory=TracedShareSettings)
+    matte: MatteSettings = field(default_factory=MatteSettings)
+    init: InitSettings = field(default_factory=InitSettings)
+    density: DensitySettings = field(default_factory=_reflection_density)
+
+    def __post_init__(self) -> None:
+        refuse_bad_numbers(self, "method.reflection")
+        for name in ("start", "densify_until"):
+            value = getattr(self, name)
+            refuse_unless(0 <= value <= 1, f"method.reflection.{name}", value, "between 0 and 1")
+        for name in ("densify_every", "sh_every", "cells", "per_cell", "rebuild_every"):
+            value = getattr(self, name)
+            refuse_unless(value >= 1, f"method.reflection.{name}", value, "at least 1")
+        every = self.opacity_reset_every
+        refuse_unless(every >= 0, "method.reflection.opacity_reset_every", every, "at least 0 (0: never)")
+        kind = self.direction_gradient
+        legal = kind in ("full", "last_sh")
+        refuse_unless(legal, "method.reflection.direction_gradient", kind, "full or last_sh")
 
 
 @dataclass(frozen=True)
@@ -180,4 +235,7 @@ class MethodSettings:
     density: DensitySettings = field(default_factory=DensitySettings)
     init: InitSettings = field(default_factory=InitSettings)
     render: RenderSettings = field(default_factory=RenderSettings)
+    materials: MaterialSettings = field(default_factory=MaterialSettings)  # these three: methods with a second stage
+    optics: OpticsSettings = field(default_factory=OpticsSettings)
+    reflection: ReflectionSettings = field(default_factory=ReflectionSettings)
     paper_schedule: ScheduleSettings = field(default_factory=ScheduleSettings)  # preset=paper takes this one

@@ -7,7 +7,7 @@ import math
 import platform
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 import rtgs
-from rtgs.methods.base import Decision, LossTerm, Method, RenderOptions, Stage
+from rtgs.methods.base import Decision, LossTerm, Method, RenderOptions, Stage, StepEvent
+from rtgs.methods.stages import stage_settings
 from rtgs.native import core
 from rtgs.scenes.scene import Scene
 from rtgs.train.checkpoint import (
@@ -107,7 +108,8 @@ class Trainer:
         self._elapsed_before = 0.0
         self._began = time.monotonic()
         self._window: list[tuple[LossTerm, ...]] = []
-        self._settings = canonical_json(RunSettings(method.settings, method.schedule, seed))
+        self._seed = seed
+        self._settings = self._settings_of(self.stage)
         self._scene_digest = scene_digest(scene)
 
     def run(self) -> TrainSummary:
@@ -124,6 +126,8 @@ class Trainer:
         self.progress.start(self.stage.name, first, self.stage.until)
         try:
             self._announce(resumed_from)
+            if first == self.stage.from_step:
+                self._note(first, self.method.begin(self.stage))
             while self._step < self.stage.until:
                 self._train_step()
                 self._between_steps()
@@ -173,13 +177,16 @@ class Trainer:
             events = self.method.after_step(step)
         except FloatingPointError as error:  # of Adam or of density control
             raise diverged(terms, self.method, step, view.name, cause=str(error)) from error
-        for event in events:
-            self.progress.note(f"step {step + 1}: {event.set_name}: {event.detail}")
+        self._note(step + 1, events)
         self._averages.add_loss(loss)
         if step % REPORT_EVERY == 0:
             self._averages.add_psnr(_psnr(rendered.image.detach(), view.image))
         self._window.append(terms.terms)
         self._step = step + 1
+
+    def _note(self, step: int, events: tuple[StepEvent, ...]) -> None:
+        for event in events:
+            self.progress.note(f"step {step}: {event.set_name}: {event.detail}")
 
     def _between_steps(self) -> None:
         """What happens every so many steps: progress, metrics, evaluation, checkpoint."""
@@ -228,7 +235,7 @@ class Trainer:
         if checkpoint is None:
             return None
         record, tensors = checkpoint.record, checkpoint.tensors
-        check_resumable(record, self._record(0), warn=self.progress.note)
+        check_resumable(record, self._expected_record(record.step), warn=self.progress.note)
         prefix = "method."
         self.method.load({name[len(prefix) :]: t for name, t in tensors.items() if name.startswith(prefix)})
         self._order.load(OrderState(tensors["views.permutation"], record.order_position, tensors["views.generator"]))
@@ -236,6 +243,20 @@ class Trainer:
         self._step = record.step
         self._elapsed_before = record.elapsed
         return record.step
+
+    def _settings_of(self, stage: Stage) -> str:
+        settings = stage_settings(self.method.settings, stage.name)
+        return canonical_json(RunSettings(settings, self.method.schedule, self._seed))
+
+    def _expected_record(self, step: int) -> CheckpointRecord:
+        """What a checkpoint of ``step`` must agree with: at the stage's first step it is of the stage before."""
+        names = [stage.name for stage in self.method.stages]
+        before = names.index(self.stage.name) - 1 if self.stage.name in names else -1
+        record = self._record(0)
+        if step > self.stage.from_step or before < 0:
+            return record
+        settings = self._settings_of(self.method.stages[before])
+        return replace(record, settings=settings, settings_digest=digest(settings))
 
     def _record(self, order_position: int) -> CheckpointRecord:
         return CheckpointRecord(

@@ -22,7 +22,10 @@ from rtgs.pipeline.fingerprint import fingerprint
 from rtgs.train.settings import ScheduleSettings
 
 ABLATIONS = [name for name in choices_of("ablation") if name != "none"]
-REFUSED = {"no_normal_loss": ("3dgs",)}  # ablations that have no object in these methods
+REFUSED = {  # ablations that have no object in these methods
+    "no_normal_loss": ("3dgs",),
+    "split_sum": ("2dgs", "3dgs", "envgs"),
+}
 SCENES = [name for name in choices_of("scene") if name != "capture"]
 
 

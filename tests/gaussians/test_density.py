@@ -256,7 +256,7 @@ def test_bad_observations_say_what_is_wrong():
     with pytest.raises(ValueError, match="4 surfels observed, but the statistics are of 3"):
         control.observe(torch.zeros(4, 2), torch.zeros(4))
     with pytest.raises(ValueError, match=r"signal must be \(N, 2\)"):
-        control.observe(torch.zeros(3, 3), torch.zeros(3))
+        control.observe(torch.zeros(3, 4), torch.zeros(3))
     with pytest.raises(FloatingPointError, match=r"1 surfels is NaN or inf \(first ids \[2\]\)"):
         control.observe(torch.tensor([[0.0, 0], [0, 0], [0, float("nan")]]), torch.zeros(3))
     with pytest.raises(ValueError, match="scene extent 0"):

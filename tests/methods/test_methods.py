@@ -37,12 +37,13 @@ def test_every_method_renders_and_lowers_its_loss(name: str):
     for step in range(5, 200, 5):  # the same view again and again
         last, _ = train_step(method, scene, step)
     assert float(last.total.detach()) < 0.8 * float(first.total.detach())
-    assert method.stages == (Stage("diffuse", 0, 60),)
+    reflective = (Stage("diffuse", 0, 3), Stage("reflection", 3, 60))
+    assert method.stages == (reflective if name in ("envgs", "rtgs") else (Stage("diffuse", 0, 60),))
     assert method_stages(method.settings, method.schedule) == method.stages
 
 
 def test_an_unknown_method_is_refused_with_the_known_ones():
-    with pytest.raises(ValueError, match=r"method\.name is '3dgz': choose one of 2dgs, 3dgs, rtgs"):
+    with pytest.raises(ValueError, match=r"method\.name is '3dgz': choose one of 2dgs, 3dgs, envgs, rtgs"):
         make(replace(small_method(), name="3dgz"))
 
 

@@ -213,7 +213,7 @@ def test_a_failing_job_does_not_stop_the_others(words, first, capsys):
         ("scene.path=/no/such/folder", ["capture folder /no/such/folder does not exist"]),
         ("scene=/no/such/folder", ["capture folder /no/such/folder does not exist", "correct scene.path"]),
         ("threads=0", ["threads=0 must be at least 1"]),
-        ("method.name=3dgs", ["method.name is '3dgs'", "2dgs"]),
+        ("method.name=3dgz", ["method.name is '3dgz'", "2dgs"]),
     ],
 )
 def test_mistakes_are_one_message_without_traceback(words, override, expected, capsys):

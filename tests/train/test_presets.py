@@ -9,7 +9,7 @@ import pytest
 from rtgs.config import compose
 from rtgs.train.schedule import check_schedule, densify_due, loss_start, opacity_reset_due, sh_degree_at
 
-METHODS = ("2dgs", "3dgs", "rtgs")
+METHODS = ("2dgs", "3dgs", "envgs", "rtgs")
 
 
 @pytest.mark.parametrize("preset", ["smoke", "quick", "standard"])
@@ -39,4 +39,4 @@ def test_the_paper_preset_is_the_methods_own_schedule_and_numbers(method: str):
     assert config.method.density.max_surfels == 2_000_000
     assert config.method.optimizer.means_initial == 1.6e-4
     start = loss_start(config.method.loss.normal_start, config.schedule.total)
-    assert start == {"2dgs": 7000, "3dgs": 7000, "rtgs": 0}[method]
+    assert start == {"2dgs": 7000, "3dgs": 7000, "envgs": 0, "rtgs": 0}[method]

@@ -1,0 +1,97 @@
+"""One mirror ray per pixel: from rasterised maps to rays, and from traced colours to the image (methods.md 3.3, 4).
+
+Plain torch in the dtype of the inputs; every step is differentiable, so the reflection's loss teaches the surface its
+normals (through the direction), its depth (through the origin) and its materials (through the weights).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from rtgs.optics.microfacet import SpecularWeights, specular_weights
+from rtgs.optics.settings import OpticsSettings
+from rtgs.train.specular_settings import MaterialSettings
+
+SHORTEST_NORMAL = 1e-3  # an accumulated normal shorter than this has no direction: such a pixel has no surface
+
+
+@dataclass(frozen=True)
+class SurfacePixels:
+    """What the base set says of P pixels. Channels first: sums over three rows are fast."""
+
+    diffuse: Tensor  # (3, P) C_d
+    specular: Tensor  # (P,) k_s as composited
+    roughness: Tensor  # (P,) in 0..1
+    f0: Tensor  # (P,), or (3, P) for rgb
+    normal: Tensor  # (3, P) world, sum of w n
+    depth: Tensor  # (P,) z-depth of the surface, world units
+
+
+@dataclass(frozen=True)
+class MirrorRays:
+    """P rays that leave the surface at the mirror direction."""
+
+    origins: Tensor  # (P, 3) world
+    directions: Tensor  # (P, 3) unit
+    cosine: Tensor  # (P,) n . omega_o
+
+
+def surface_pixels(
+    features: Tensor, alpha: Tensor, depth: Tensor, normal: Tensor, settings: MaterialSettings
+) -> SurfacePixels:
+    """Split the base set's maps of P pixels into what they mean.
+
+    Args:
+        features: (5 + F, P) rgb, k_s, roughness, f0, all composited.
+        alpha: (P,); depth: (P,) already the surface's; normal: (3, P).
+        settings: whether roughness and f0 are divided by alpha (register row 8).
+    """
+    diffuse, specular, roughness, f0 = features[:3], features[3], features[4], features[5:]
+    if settings.normalized:
+        cover = alpha.clamp_min(settings.smallest_alpha)
+        roughness, f0 = roughness / cover, f0 / cover
+    f0 = f0[0] if len(f0) == 1 else f0
+    return SurfacePixels(diffuse, specular, roughness, f0, normal, depth)
+
+
+def mirror_rays(pixels: SurfacePixels, center: Tensor, view: Tensor) -> MirrorRays:
+    """Reflect the pixels' rays (3, P), camera-z component 1, from the camera at ``center`` (3,) world."""
+    outward = -view / view.norm(dim=0)  # omega_o
+    normal = pixels.normal * pixels.normal.square().sum(0).clamp_min(SHORTEST_NORMAL**2).rsqrt()
+    cosine = (normal * outward).sum(0)
+    directions = 2 * cosine * normal - outward
+    origins = center[:, None] + pixels.depth * view
+    return MirrorRays(origins.T.contiguous(), directions.T.contiguous(), cosine)
+
+
+def pixel_weights(cosine: Tensor, pixels: SurfacePixels, optics: OpticsSettings) -> SpecularWeights:
+    """Weights of the traced colours, channels first: (P,), or (3, P) with an rgb f0."""
+    if pixels.f0.ndim == 1:
+        return specular_weights(cosine, pixels.roughness, pixels.f0, optics)
+    weights = specular_weights(cosine, pixels.roughness, pixels.f0.T, optics)
+    return SpecularWeights(weights.reflection.T, weights.transmission.T, weights.fresnel.T)
+
+
+def specular_change(pixels: SurfacePixels, weight: Tensor, traced: Tensor, emphasis: Tensor | None) -> Tensor:
+    """(3, P) what reflection adds to C_d: k_s (w_r C_r - C_d), so that C_d plus it is (1 - k_s) C_d + k_s w_r C_r.
+
+    ``emphasis`` (P,) multiplies the gradient and leaves the value alone: 1 / share for pixels drawn with that share
+    makes the gradient of every parameter right on average (docs/reflection.md).
+    """
+    change = pixels.specular * (weight * traced - pixels.diffuse)
+    return change if emphasis is None else _Emphasize.apply(change, emphasis)  # type: ignore[return-value]
+
+
+class _Emphasize(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, value: Tensor, emphasis: Tensor) -> Tensor:
+        ctx.save_for_backward(emphasis)
+        return value.view_as(value)
+
+    @staticmethod
+    def backward(ctx, upstream: Tensor):  # type: ignore[override]
+        (emphasis,) = ctx.saved_tensors
+        return upstream * emphasis, None

@@ -1,0 +1,334 @@
+"""Methods with a second stage: one mirror ray per pixel, traced through a set of its own (methods.md 3.3, 6.1, 6.2)."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from rtgs.cameras import Camera
+from rtgs.evaluate.weights import MissingWeights
+from rtgs.gaussians.materials import MaterialSurfels, activate_materials, with_materials, without_materials
+from rtgs.gaussians.surfels import Surfels
+from rtgs.methods.base import (
+    Decision,
+    LossTerms,
+    RenderedView,
+    RenderOptions,
+    SpecularLayers,
+    Stage,
+    StepEvent,
+)
+from rtgs.methods.matte import MatteEvidence, gather_evidence
+from rtgs.methods.mirror import (
+    SHORTEST_NORMAL,
+    SurfacePixels,
+    mirror_rays,
+    pixel_weights,
+    specular_change,
+    surface_pixels,
+)
+from rtgs.methods.propagation import propagate_normals, reset_specular
+from rtgs.methods.reflection_set import ReflectionSet, reflection_surfels
+from rtgs.methods.surfel_base import SurfelMethod
+from rtgs.methods.traced_pixels import TracedPixels, choose_pixels
+from rtgs.render.buffers import RasterBuffers, TraceOptions
+from rtgs.train.losses import surface_depth
+from rtgs.train.perceptual import PerceptualLoss
+from rtgs.train.schedule import (
+    base_densify_due,
+    densify_ahead,
+    densify_due,
+    loss_start,
+    opacities_held,
+    opacity_reset_due,
+    propagation_due,
+    reflection_plan,
+    reflection_reset_due,
+    sh_degree_at,
+)
+from rtgs.train.settings import MethodSettings, ScheduleSettings
+
+if TYPE_CHECKING:
+    from rtgs.scenes.scene import Scene, View
+
+
+class ReflectiveMethod(SurfelMethod):
+    """A base set with materials and a reflection set: image = (1 - k_s) C_d + k_s w_r C_r.
+
+    The first stage is :class:`SurfelMethod`; :meth:`begin` of the second adds materials and the reflection set. They
+    are there exactly while reflection is in use: a scene found matte loses them again and goes on as in stage one.
+    """
+
+    def __init__(
+        self, settings: MethodSettings, scene: Scene, schedule: ScheduleSettings, generator: torch.Generator
+    ) -> None:
+        super().__init__(settings, scene, schedule, generator)
+        self.plan = reflection_plan(settings.reflection, schedule)
+        self.reflection: ReflectionSet | None = None
+        self._matte: MatteEvidence | None = None
+        self.perceptual = self._find_perceptual()
+        self._points = scene.points
+        self._views = scene.train
+
+    @staticmethod
+    def declare_stages(settings: MethodSettings, schedule: ScheduleSettings) -> tuple[Stage, ...]:
+        start = reflection_plan(settings.reflection, schedule).start
+        if start >= schedule.total:
+            return (Stage("diffuse", 0, schedule.total),)
+        if start == 0:
+            return (Stage("reflection", 0, schedule.total),)
+        return (Stage("diffuse", 0, start), Stage("reflection", start, schedule.total))
+
+    @property
+    def sets(self):
+        return (self.base,) if self.reflection is None else (self.base, self.reflection)
+
+    def begin(self, stage: Stage) -> tuple[StepEvent, ...]:
+        """The reflection stage: materials on the base set, the reflection set in its box."""
+        if stage.name != "reflection":
+            return ()
+        self.base.adopt(with_materials(self.base.surfels, self.settings.materials))  # type: ignore[arg-type]
+        self.reflection = self._new_set(reflection_surfels(self.settings.reflection, self._points, self.generator))
+        return (StepEvent("begin", "reflection", f"{len(self.reflection)} surfels in the box"),)
+
+    def _find_perceptual(self) -> PerceptualLoss | None:
+        """The perceptual loss where its weights are there; else a decision says why it is left out."""
+        if self.settings.loss.perceptual == 0:
+            return None
+        try:
+            return PerceptualLoss(self.settings.loss)
+        except MissingWeights as error:
+            why = str(error).splitlines()[0]
+            self.decisions = (*self.decisions, Decision("no perceptual loss", why))
+            return None
+
+    def _new_set(self, surfels: Surfels) -> ReflectionSet:
+        return ReflectionSet(
+            "reflection",
+            surfels,
+            optimizer=self.settings.optimizer,
+            density=self.settings.reflection.density,
+            means_lr_steps=self.schedule.means_lr_steps,
+            extent=self.extent,
+            rebuild_every=self.settings.reflection.rebuild_every,
+        )
+
+    # ---- rendering
+
+    def training_options(self, step: int) -> RenderOptions:
+        options = super().training_options(step)
+        return options if self.reflection is None else self._with_surface(options)
+
+    def _with_surface(self, options: RenderOptions) -> RenderOptions:
+        ratio = self.settings.render.depth_ratio
+        return replace(
+            options,
+            depth=options.depth or ratio < 1,
+            median_depth=options.median_depth or ratio > 0,
+            normal=True,
+        )
+
+    def base_features(self, colors: Tensor) -> Tensor:
+        if self.reflection is None:
+            return colors
+        assert isinstance(self.base.surfels, MaterialSurfels)
+        materials = activate_materials(self.base.surfels, self.settings.materials)
+        return torch.cat((colors, materials.specular[:, None], materials.roughness[:, None], materials.f0), dim=1)
+
+    def render(self, camera: Camera, step: int, options: RenderOptions | None = None) -> RenderedView:
+        """Render one view; in training only some pixels may be traced, and the image of the others is C_d."""
+        if self.reflection is None:
+            return super().render(camera, step, options)
+        buffers = self.rasterize_base(camera, step, None if options is None else self._with_surface(options))
+        flat = self._flat_pixels(buffers)
+        rays = camera.rays()
+        view = rays.directions.reshape(-1, 3).T
+        chosen = self._choose(flat, buffers, view, training=options is None)
+        pixels = _take(flat, chosen.index)
+        mirrored = mirror_rays(pixels, rays.origin, view[:, chosen.index])
+        ahead = self.reflection.density.needs_signal and densify_ahead(self.plan.reflection, step)
+        watched = options is None and ahead
+        traced = self.reflection.trace(
+            mirrored.origins, mirrored.directions, self._trace_options(step, watched), watched=watched
+        )
+        assert traced.colors is not None
+        color = traced.colors.T
+        weight = pixel_weights(mirrored.cosine, pixels, self.settings.optics).reflection
+        change = specular_change(pixels, weight, color, chosen.emphasis)
+        shape = (3, camera.height, camera.width)
+        image = flat.diffuse.index_add(1, chosen.index, change).reshape(shape)
+        specular = flat.specular.reshape(shape[1:])
+        layers = None
+        if options is not None and options.layers:
+            layers = _layers(flat, chosen, pixels.specular * weight * color, color, shape)
+        return RenderedView(camera, image, buffers, layers, specular)
+
+    def _flat_pixels(self, buffers: RasterBuffers) -> SurfacePixels:
+        """Every pixel of the view, flattened."""
+        depth = buffers.alpha if buffers.depth is None else buffers.depth  # unused at ratio 1
+        surface = surface_depth(depth, buffers.alpha, buffers.median_depth, self.settings.render.depth_ratio)
+        assert buffers.normal is not None
+        return surface_pixels(
+            buffers.features.flatten(1),
+            buffers.alpha.flatten(),
+            surface.flatten(),
+            buffers.normal.flatten(1),
+            self.settings.materials,
+        )
+
+    @torch.no_grad()
+    def _choose(self, flat: SurfacePixels, buffers: RasterBuffers, view: Tensor, *, training: bool) -> TracedPixels:
+        settings = self.settings.reflection
+        surface = (buffers.alpha.flatten() > settings.smallest_alpha) & (flat.depth > 0)
+        surface &= flat.normal.square().sum(0) > SHORTEST_NORMAL**2
+        showing = None
+        if settings.traced.threshold > 0:
+            unit = flat.normal / flat.normal.norm(dim=0).clamp_min(SHORTEST_NORMAL)
+            cosine = -(unit * view).sum(0) / view.norm(dim=0)
+            weight = pixel_weights(cosine, flat, self.settings.optics).reflection
+            weight = weight if weight.ndim == 1 else weight.amax(0)
+            showing = (flat.specular * weight.clamp_min(1)).reshape(buffers.alpha.shape)
+        generator = self.generator if training else None
+        return choose_pixels(surface.reshape(buffers.alpha.shape), showing, settings.traced, generator)
+
+    def _trace_options(self, step: int, watched: bool) -> TraceOptions:
+        settings = self.settings.reflection
+        assert self.reflection is not None
+        return TraceOptions(
+            t_min=settings.offset * self.extent,
+            transmittance_cutoff=settings.transmittance_cutoff,
+            alpha_cutoff=settings.alpha_cutoff,
+            sh_degree=self._reflection_degree(step),
+            weight_sum=watched,
+            direction_gradient=settings.direction_gradient,  # type: ignore[arg-type]
+        )
+
+    def _reflection_degree(self, step: int) -> int:
+        assert self.reflection is not None
+        return sh_degree_at(self.plan.reflection, step, self.reflection.surfels.sh_degree)
+
+    # ---- between steps
+
+    def after_step(self, step: int) -> tuple[StepEvent, ...]:
+        """Adam on both sets, then what the plan asks of them before the next step."""
+        if self.reflection is None:
+            return super().after_step(step)
+        held = ("opacity_logits",) if opacities_held(self.plan, self.settings.reflection, step) else ()
+        self.base.step(step, self.sh_degree(step), held=held)
+        self.base.perturb(step, self.generator)
+        self.reflection.step(step, self._reflection_degree(step))
+        self.reflection.perturb(step, self.generator)
+        following = step + 1
+        events: list[StepEvent] = []
+        if self.plan.start < following == self.plan.judged < self.schedule.total:
+            events += self._judge(following)
+        if base_densify_due(self.plan, self.settings.reflection, following):
+            events.append(self.densify(self.base, self.settings.density.min_opacity, following))
+        if self.reflection is not None and densify_due(self.plan.reflection, following):
+            events.append(self.densify(self.reflection, self.settings.reflection.density.min_opacity, following))
+        return (*events, *self._resets(following))
+
+    def _resets(self, following: int) -> list[StepEvent]:
+        """Opacity resets of both sets, k_s resets, normal propagation."""
+        settings = self.settings
+        events = []
+        if self.base.density.resets_opacity and opacity_reset_due(self.schedule, following):
+            events.append(self.reset_opacity(self.base, settings.density.reset_opacity))
+            if self.reflection is not None and settings.reflection.specular_reset:
+                reset_specular(self.base, settings.materials.specular)
+        if self.reflection is None:
+            return events
+        if self.reflection.density.resets_opacity and reflection_reset_due(self.plan, following):
+            events.append(self.reset_opacity(self.reflection, settings.reflection.density.reset_opacity))
+        if propagation_due(self.plan, settings.reflection, following):
+            events.append(propagate_normals(self.base, settings.reflection.propagation, self.generator))
+        return events
+
+    def _judge(self, following: int) -> list[StepEvent]:
+        """Look at some training views; a scene with nothing specular goes on without the second stage."""
+        settings = self.settings.reflection.matte
+        count = min(settings.views, len(self._views))
+        chosen = [self._views[round(k * (len(self._views) - 1) / max(count - 1, 1))] for k in range(count)]
+        with torch.no_grad():
+            rendered = (self.render(view.camera, following, RenderOptions(layers=True)) for view in chosen)
+            evidence = gather_evidence(zip(rendered, chosen, strict=True), settings.specular)
+        if not evidence.is_matte(settings):
+            return [StepEvent("decision", "reflection", f"goes on: {evidence}")]
+        self._drop(evidence)
+        return [StepEvent("decision", "reflection", f"{self.decisions[-1].what}: {self.decisions[-1].why}")]
+
+    def _drop(self, evidence: MatteEvidence) -> None:
+        """Go on as in the first stage."""
+        self.reflection = None
+        self.base.adopt(without_materials(self.base.surfels))  # type: ignore[arg-type]
+        self._tell_matte(evidence)
+
+    def _tell_matte(self, evidence: MatteEvidence) -> None:
+        self._matte = evidence
+        why = f"nothing specular in this scene: {evidence}"
+        self.decisions = (*self.decisions, Decision("the reflection stage ended early", why))
+
+    # ---- losses
+
+    def losses(self, rendered: RenderedView, view: View, step: int) -> LossTerms:
+        """Those of the first stage; L_perc, and L_spec in masks of transparent objects (methods.md 5)."""
+        found = super().losses(rendered, view, step)
+        if rendered.specular is None:
+            return found
+        loss, total = self.settings.loss, self.schedule.total
+        if self.perceptual is not None and step >= loss_start(loss.perceptual_start, total):
+            value = self.perceptual(rendered.image, view.image, self.generator)
+            found = found.plus("perceptual", value, loss.perceptual)
+        if loss.specular > 0 and view.mask is not None and step >= loss_start(loss.specular_start, total):
+            value = (view.mask * (loss.specular_target - rendered.specular).clamp_min(0)).mean()
+            found = found.plus("specular", value, loss.specular)
+        return found
+
+    # ---- state
+
+    def state(self) -> dict[str, Tensor]:
+        tensors = super().state()
+        if self._matte is not None:
+            tensors["matte"] = self._matte.tensor()
+        return tensors
+
+    def load(self, state: dict[str, Tensor]) -> None:
+        """Go on from :meth:`state` of either stage."""
+        if ("base.surfels.specular_logits" in state) != isinstance(self.base.surfels, MaterialSurfels):
+            plain = without_materials(self.base.surfels)  # type: ignore[arg-type]
+            specular = "base.surfels.specular_logits" in state
+            self.base.adopt(with_materials(plain, self.settings.materials) if specular else plain)
+        names = [field.name for field in fields(Surfels)]
+        rows = {name: state[f"reflection.surfels.{name}"] for name in names if f"reflection.surfels.{name}" in state}
+        self.reflection = self._new_set(Surfels(**{name: rows[name].clone() for name in names})) if rows else None
+        super().load(state)
+        if "matte" in state:
+            self._tell_matte(MatteEvidence.of(state["matte"]))
+
+
+def _take(pixels: SurfacePixels, index: Tensor) -> SurfacePixels:
+    """The pixels of an index (P,)."""
+    rows = (getattr(pixels, name) for name in ("diffuse", "specular", "roughness", "f0", "normal", "depth"))
+    return SurfacePixels(*(row.index_select(-1, index) for row in rows))
+
+
+def _layers(flat: SurfacePixels, chosen: TracedPixels, reflection: Tensor, color: Tensor, shape) -> SpecularLayers:
+    """The maps of a view from what was traced."""
+
+    def full(values: Tensor) -> Tensor:
+        return torch.zeros(3, shape[1] * shape[2]).index_copy(1, chosen.index, values).reshape(shape)
+
+    traced = torch.zeros(shape[1] * shape[2], dtype=torch.bool)
+    traced[chosen.index] = True
+    return SpecularLayers(
+        diffuse=flat.diffuse.reshape(shape),
+        reflection=full(reflection.detach()),
+        reflected_color=full(color.detach()),
+        specular=flat.specular.reshape(shape[1:]),
+        roughness=flat.roughness.reshape(shape[1:]),
+        f0=flat.f0.reshape(*flat.f0.shape[:-1], *shape[1:]),
+        traced=traced.reshape(shape[1:]),
+    )

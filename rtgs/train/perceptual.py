@@ -1,0 +1,51 @@
+"""L_perc on random crops (methods.md 5; register row 20). Only where the pretrained VGG-16 is on this machine."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from rtgs.evaluate.lpips import InputRange, Lpips
+from rtgs.evaluate.weights import LPIPS_VGG, VGG16, find_weights
+from rtgs.train.settings import LossSettings
+
+
+class PerceptualLoss:
+    """Distance of VGG features of one random crop per step: the whole image would cost more than the rest of a step."""
+
+    def __init__(self, settings: LossSettings, network: Lpips | None = None) -> None:
+        """``network``: default the registered one, read at the first use.
+
+        Raises:
+            MissingWeights: a pretrained file is not on this machine.
+        """
+        self._settings = settings
+        self._given = network
+        if network is None:
+            find_weights(VGG16)
+            find_weights(LPIPS_VGG)
+
+    @cached_property
+    def network(self) -> Lpips:
+        return self._given or Lpips.load()
+
+    def __call__(self, image: Tensor, target: Tensor, generator: torch.Generator) -> Tensor:
+        """Scalar, differentiable in ``image`` (3, H, W); ``target`` alike, both in [0, 1]."""
+        rows, columns = (min(self._settings.perceptual_crop, size) for size in image.shape[1:])
+        top, left = (
+            int(torch.randint(size - crop + 1, (), generator=generator))
+            for size, crop in zip(image.shape[1:], (rows, columns), strict=True)
+        )
+        part = (slice(None), slice(top, top + rows), slice(left, left + columns))
+        if self._settings.perceptual_form == "lpips":
+            return self.network(image[part], target[part], InputRange.ZERO_ONE)
+        return self._feature_distance(image[part], target[part])
+
+    def _feature_distance(self, image: Tensor, target: Tensor) -> Tensor:
+        """The paper's form: mean L1 distance of raw features, mean over the five blocks."""
+        shift, scale = (self.network.get_buffer(name) for name in ("shift", "scale"))
+        activations = self.network.features((torch.stack((image, target)) - shift) / scale)
+        distances = [(activation[0] - activation[1]).abs().mean() for activation in activations]
+        return torch.stack(distances).mean()

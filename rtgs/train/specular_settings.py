@@ -1,0 +1,95 @@
+"""Numbers of the second stage that stand for themselves: materials, normal propagation, what is traced, matte scenes.
+
+Boundaries are shares of the run (``schedule.total``), intervals are steps: see ``rtgs.train.settings``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from rtgs.train.refuse import refuse_bad_numbers, refuse_unless
+
+
+@dataclass(frozen=True)
+class MaterialSettings:
+    """What each surfel of the base set says about its surface (methods.md 2, 3.3, 4.2, 4.4)."""
+
+    specular: float = 1e-3  # initial k_s: EnvGS 1e-3 (register row 28: for all scenes); 0.1 for gardenspheres
+    roughness: float = 0.005  # initial: with f0 0.04 the weight w_r starts at 0.2 (methods.md 4.4)
+    f0: float = 0.04  # initial reflectance at normal incidence: a dielectric; 0.5 for mirrors
+    f0_channels: int = 1  # register row 6: the paper writes a scalar; 3 = rgb
+    roughness_curve: str = "log"  # roughness = floor^(1 - sigmoid(raw)); "linear": floor + (1 - floor) sigmoid(raw)
+    roughness_floor: float = 1e-3  # methods.md 4.2: without it the remap turns round
+    normalized: bool = True  # register row 8: roughness and f0 maps are divided by the accumulated alpha, k_s is not
+    smallest_alpha: float = 1e-3  # the least they are divided by
+
+    def __post_init__(self) -> None:
+        refuse_bad_numbers(self, "method.materials")
+        for name in ("specular", "f0"):
+            value = getattr(self, name)
+            refuse_unless(0 < value < 1, f"method.materials.{name}", value, "between 0 and 1")
+        floor = self.roughness_floor
+        refuse_unless(0 < floor < 1, "method.materials.roughness_floor", floor, "between 0 and 1")
+        refuse_unless(
+            floor < self.roughness < 1, "method.materials.roughness", self.roughness, f"between {floor} and 1"
+        )
+        refuse_unless(self.f0_channels in (1, 3), "method.materials.f0_channels", self.f0_channels, "1 or 3")
+        curves = ("log", "linear")
+        refuse_unless(
+            self.roughness_curve in curves, "method.materials.roughness_curve", self.roughness_curve, "log or linear"
+        )
+
+
+@dataclass(frozen=True)
+class PropagationSettings:
+    """EnvGS's normal propagation and colour sabotage (methods.md 6.1; invented in 3DGS-DR)."""
+
+    every: int = 1000  # steps; 0 = never. Not at the steps of an opacity reset
+    until: float = 0.3  # share of the run: 18,000 of 60,000
+    opacity: float = 0.9  # opacities of the base set become at least this
+    grow: float = 1.5  # scales of specular surfels are multiplied by it
+    grow_border: float = 0.02  # specular: k_s at least this
+    hold_every: int = 200  # opacities stand still until the next multiple of it
+    sabotage: float = 0.4  # half width of the uniform noise added to SH dc; 0 = none
+    sabotage_border: float = 0.05  # surfels with k_s at most this get it
+    densify_every: int = 500  # interval of the base set's density control while propagation runs
+
+    def __post_init__(self) -> None:
+        refuse_bad_numbers(self, "method.reflection.propagation")
+        refuse_unless(0 <= self.until <= 1, "method.reflection.propagation.until", self.until, "between 0 and 1")
+        refuse_unless(self.every >= 0, "method.reflection.propagation.every", self.every, "at least 0 (0: never)")
+        for name in ("hold_every", "densify_every"):
+            value = getattr(self, name)
+            refuse_unless(value >= 1, f"method.reflection.propagation.{name}", value, "at least 1 step")
+
+
+@dataclass(frozen=True)
+class TracedShareSettings:
+    """Which pixels are traced: those where a mirror ray shows, and in training a random part of the rest."""
+
+    threshold: float = 0.0  # k_s * max(w_r, 1) below which a pixel counts as one of the rest; 0 = trace all, as EnvGS
+    share: float = 0.25  # of the rest, in training: whole tiles, drawn afresh each step, gradients times 1 / share
+    tile: int = 8  # side of these tiles, pixels
+
+    def __post_init__(self) -> None:
+        refuse_bad_numbers(self, "method.reflection.traced")
+        refuse_unless(0 < self.share <= 1, "method.reflection.traced.share", self.share, "above 0 and at most 1")
+        refuse_unless(
+            self.tile >= 4 and self.tile % 4 == 0, "method.reflection.traced.tile", self.tile, "a multiple of 4"
+        )
+
+
+@dataclass(frozen=True)
+class MatteSettings:
+    """How a scene with nothing specular is recognised, from its training views alone (docs/reflection.md)."""
+
+    probation: float = 1 / 60  # share of the run: then the stage is judged, before any propagation or reset; 0 = never
+    views: int = 12  # training views looked at, evenly spaced
+    specular: float = 0.1  # a pixel counts as specular when its k_s is at least this
+    share: float = 0.002  # with fewer specular pixels than this the scene is matte
+    gain: float = 0.02  # so is it when tracing lowers the squared error of the specular pixels by less than this
+
+    def __post_init__(self) -> None:
+        refuse_bad_numbers(self, "method.reflection.matte")
+        refuse_unless(0 <= self.probation <= 1, "method.reflection.matte.probation", self.probation, "between 0 and 1")
+        refuse_unless(self.views >= 1, "method.reflection.matte.views", self.views, "at least 1")

@@ -1,0 +1,134 @@
+"""The composed render of the second stage, forward and backward, against a float64 composition of the twins."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import pytest
+import torch
+from reflective_cases import new_method, recipe, schedule, tiny
+from torch import Tensor
+
+from rtgs.gaussians.materials import activate_materials
+from rtgs.gaussians.surfels import activate
+from rtgs.methods import Stage
+from rtgs.methods.mirror import (
+    SHORTEST_NORMAL,
+    mirror_rays,
+    pixel_weights,
+    specular_change,
+    surface_pixels,
+)
+from rtgs.methods.reflective import ReflectiveMethod
+from rtgs.optics.settings import OpticsSettings
+from rtgs.render import reference, reference_trace
+from rtgs.render.discontinuities import discontinuity_mask
+from rtgs.render.trace_discontinuities import fragile_rays
+from rtgs.train.specular_settings import MaterialSettings, PropagationSettings
+
+STEP = 40  # SH of degree 2 in both sets
+
+
+@dataclass(frozen=True)
+class TwinRender:
+    image: Tensor  # (3, H, W) float64
+    fragile: Tensor  # (H, W) bool: a decision lies within float32 rounding of its threshold
+
+
+def twin_render(method: ReflectiveMethod, base, reflection, camera) -> TwinRender:
+    """What ``method.render`` computes, from float64 copies of both sets, by the readable twins alone."""
+    settings = method.settings
+    surfels = activate(base, camera.center, method.sh_degree(STEP))
+    materials = activate_materials(base, settings.materials)
+    features = torch.cat((surfels.colors, materials.specular[:, None], materials.roughness[:, None], materials.f0), 1)
+    shape = (surfels.means, surfels.tangent_u, surfels.tangent_v, surfels.scales, surfels.opacities)
+    options = method.raster_options(method.training_options(STEP), weight_sum=False)
+    buffers = reference.rasterize_surfels(*shape, features, camera, options=options)
+    assert buffers.normal is not None
+    assert buffers.depth is not None
+    depth = buffers.depth / buffers.alpha.clamp_min(1e-6)
+    flat = surface_pixels(
+        buffers.features.flatten(1),
+        buffers.alpha.flatten(),
+        depth.flatten(),
+        buffers.normal.flatten(1),
+        settings.materials,
+    )
+    length = flat.normal.norm(dim=0)
+    covered = (buffers.alpha.flatten() > settings.reflection.smallest_alpha) & (length > SHORTEST_NORMAL)
+    rays = camera.rays(torch.float64)
+    traced_set = activate(reflection, camera.center, 0)
+    mirrored = mirror_rays(flat, rays.origin, rays.directions.reshape(-1, 3).T)
+    traced_shape = (
+        traced_set.means,
+        traced_set.tangent_u,
+        traced_set.tangent_v,
+        traced_set.scales,
+        traced_set.opacities,
+    )
+    trace = replace(method._trace_options(STEP, False), t_min=settings.reflection.offset * method.extent)
+    colors = {"sh_dc": reflection.sh_dc, "sh_rest": reflection.sh_rest}
+    traced = reference_trace.trace_surfels(
+        *traced_shape, mirrored.origins, mirrored.directions, **colors, options=trace
+    )
+    assert traced.colors is not None
+    weight = pixel_weights(mirrored.cosine, flat, settings.optics).reflection
+    change = torch.where(covered, specular_change(flat, weight, traced.colors.T, None), 0.0)
+    image = (flat.diffuse + change).reshape(3, camera.height, camera.width)
+    fragile = discontinuity_mask(*shape, features, camera, options=options).flatten()
+    fragile |= fragile_rays(*traced_shape, mirrored.origins, mirrored.directions, **colors, options=trace)
+    fragile |= (length < 0.05) | ((buffers.alpha.flatten() - settings.reflection.smallest_alpha).abs() < 1e-4)
+    return TwinRender(image, fragile.reshape(camera.height, camera.width))
+
+
+def doubled(surfels):
+    """A float64 copy that requires gradients."""
+    values = {name: tensor.detach().double().requires_grad_() for name, tensor in surfels.items()}
+    return type(surfels)(**values)
+
+
+CASES = {
+    "microfacet": (OpticsSettings(), MaterialSettings(specular=0.3)),
+    "rgb f0, linear roughness": (
+        OpticsSettings(masking="separable"),
+        MaterialSettings(specular=0.3, f0_channels=3, roughness_curve="linear", roughness=0.1),
+    ),
+    "not normalised": (OpticsSettings(max_gain=1.0), MaterialSettings(specular=0.3, f0=0.5, normalized=False)),
+    "split sum": (OpticsSettings(weight="split_sum"), MaterialSettings(specular=0.3, roughness=0.2)),
+    "envgs": (OpticsSettings(weight="envgs"), MaterialSettings(specular=0.3)),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_image_and_every_gradient_are_those_of_the_twins(case: str):
+    made = tiny()
+    optics, materials = CASES[case]
+    quiet = recipe(propagation=PropagationSettings(every=0))
+    method = new_method(replace(quiet, optics=optics, materials=materials), made, schedule())
+    method.begin(Stage("reflection", 15, 60))
+    generator = torch.Generator().manual_seed(4)
+    with torch.no_grad():
+        for part in method.sets:
+            part.surfels.sh_rest += 0.1 * torch.randn(part.surfels.sh_rest.shape, generator=generator)
+            part.surfels.opacity_logits += 1.5
+        method.base.surfels.log_scales += 0.3
+    camera = made.scene.train[0].camera
+    base, reflection = doubled(method.sets[0].surfels), doubled(method.sets[1].surfels)
+    twin = twin_render(method, base, reflection, camera)
+    rendered = method.render(camera, STEP)
+    clear = ~twin.fragile
+    assert float(clear.double().mean()) > 0.3
+    error = (rendered.image.detach().double() - twin.image.detach()).abs().amax(0)
+    assert float(error[clear].max()) < 2e-4
+    upstream = torch.randn(twin.image.shape, generator=generator, dtype=torch.float64) * clear
+    (twin.image * upstream).sum().backward()
+    (rendered.image * upstream.float()).sum().backward()
+    for part, exact in zip(method.sets, (base, reflection), strict=True):
+        for name, tensor in part.surfels.items():
+            expected = getattr(exact, name).grad
+            if expected is None or float(expected.abs().max()) == 0:
+                assert tensor.grad is None or float(tensor.grad.abs().max()) < 1e-6, f"{part.name}.{name}"
+                continue
+            assert tensor.grad is not None, f"{part.name}.{name}"
+            difference = (tensor.grad.double() - expected).norm() / expected.norm()
+            assert float(difference) < 2e-3, f"{part.name}.{name}: {float(difference):.2g}"

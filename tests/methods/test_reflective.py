@@ -1,0 +1,273 @@
+"""Methods with a second stage: gradients against the twins, schedule, exact resume, matte scenes, stress."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import fields, replace
+from pathlib import Path
+
+import pytest
+import torch
+from reflective_cases import SAMPLED, new_method, recipe, schedule, tiny, train_all
+from safetensors.torch import load_file
+
+from rtgs.gaussians.materials import MATERIAL_NAMES, MaterialSurfels
+from rtgs.methods import RenderOptions, Stage
+from rtgs.methods.reflective import ReflectiveMethod
+from rtgs.train.checkpoint import checkpoint_path
+from rtgs.train.settings import MethodSettings
+from rtgs.train.specular_settings import MatteSettings, PropagationSettings, TracedShareSettings
+from rtgs.train.trainer import Trainer
+
+TESTS = Path(__file__).parent
+
+
+def in_second_stage(settings: MethodSettings | None = None, *, steps: int = 0, strength: float = 0.8):
+    """A method at the start of its second stage, or ``steps`` later; its scene."""
+    made = tiny(strength)
+    method = new_method(settings or recipe(), made, schedule())
+    method.begin(Stage("reflection", 15, 60))
+    for step in range(15, 15 + steps):
+        train_step(method, made, step)
+    return method, made
+
+
+def train_step(method: ReflectiveMethod, made, step: int):
+    view = made.scene.train[step % len(made.scene.train)]
+    terms = method.losses(method.render(view.camera, step), view, step)
+    terms.total.backward()
+    return terms, method.after_step(step)
+
+
+def test_the_first_stage_is_that_of_the_plain_method_and_the_second_adds_what_it_needs():
+    made = tiny()
+    method = new_method(recipe(), made, schedule())
+    assert method.stages == (Stage("diffuse", 0, 15), Stage("reflection", 15, 60))
+    assert method.begin(method.stages[0]) == ()
+    view = made.scene.train[0]
+    assert method.render(view.camera, 0).specular is None
+    assert method.sets == (method.base,)
+    method.begin(method.stages[1])
+    assert [part.name for part in method.sets] == ["base", "reflection"]
+    assert isinstance(method.base.surfels, MaterialSurfels)
+    assert len(method.sets[1]) == 3**3 * 4
+    with torch.no_grad():
+        rendered = method.render(view.camera, 15, RenderOptions(layers=True))
+    layers = rendered.layers
+    assert layers is not None
+    blended = layers.diffuse * (1 - layers.specular * layers.traced) + layers.reflection
+    torch.testing.assert_close(rendered.image, blended, atol=2e-6, rtol=0)
+    assert bool(layers.traced.any())
+    assert float(layers.reflection[:, ~layers.traced].abs().sum()) == 0
+
+
+@pytest.mark.parametrize(("start", "stages"), [(1.0, ["diffuse"]), (0.0, ["reflection"])])
+def test_a_share_of_one_leaves_the_stage_out_and_of_zero_the_first(start: float, stages: list[str]):
+    method = new_method(recipe(start=start), tiny(), schedule())
+    assert [stage.name for stage in method.stages] == stages
+
+
+@pytest.mark.parametrize("name", ["rtgs", "envgs"])
+def test_the_reflection_set_alone_learns_what_the_mirror_shows(name: str):
+    method, made = in_second_stage(recipe(name, propagation=PropagationSettings(every=0)))
+    with torch.no_grad():
+        method.base.surfels.specular_logits.fill_(2.0)  # type: ignore[union-attr]
+        method.base.surfels.f0_logits.fill_(3.0)  # type: ignore[union-attr]
+    held = tuple(field.name for field in fields(MaterialSurfels))
+    view = made.scene.train[0]
+    losses = []
+    for step in range(15, 115):
+        terms = method.losses(method.render(view.camera, step), view, step)
+        terms.total.backward()
+        losses.append(terms.terms[0].value)
+        method.base.step(step, 0, held=held)
+        method.sets[1].step(step, 0)
+    assert losses[-1] < 0.6 * losses[0]
+
+
+def test_every_parameter_of_both_sets_learns():
+    method, made = in_second_stage(steps=12)
+    before = {part.name: part.surfels.detached() for part in method.sets}
+    for step in range(27, 29):  # between two density controls
+        train_step(method, made, step)
+    for part in method.sets:
+        for name, tensor in part.surfels.items():
+            moved = (tensor.detach() - getattr(before[part.name], name)).abs().amax()
+            assert float(moved) > 0, f"{part.name}.{name}"
+
+
+def test_the_normals_learn_from_reflection_alone():
+    """A loss on the change that reflection makes reaches rotations and means of the base set."""
+    method, made = in_second_stage(steps=5)
+    rendered = method.render(made.scene.train[0].camera, 20)
+    weight = torch.rand(rendered.image.shape, generator=torch.Generator().manual_seed(0))
+    (weight * (rendered.image - rendered.buffers.features[:3])).sum().backward()
+    for name in ("quaternions", "means", *MATERIAL_NAMES):
+        gradient = getattr(method.base.surfels, name).grad
+        assert float(gradient.abs().sum()) > 0, name
+
+
+def test_sampled_pixels_leave_the_gradient_right_on_average():
+    settings = recipe(traced=TracedShareSettings(threshold=0.5, share=0.3, tile=4))
+    method, made = in_second_stage(settings)
+    view = made.scene.train[0]
+    weight = torch.rand(view.image.shape, generator=torch.Generator().manual_seed(1))
+
+    def gradients() -> list[torch.Tensor]:
+        (weight * method.render(view.camera, 15).image).sum().backward()
+        found = [p.grad.clone() for part in method.sets for _, p in part.surfels.items() if p.grad is not None]
+        for part in method.sets:
+            part.optimizer.zero_grad()
+        return found
+
+    draws = 150
+    mean = gradients()
+    for _ in range(draws - 1):
+        mean = [total + one for total, one in zip(mean, gradients(), strict=True)]
+    method.settings = replace(method.settings, reflection=replace(settings.reflection, traced=TracedShareSettings()))
+    for name, total, exact in zip(range(99), mean, gradients(), strict=False):
+        error = (total / draws - exact).norm() / exact.norm().clamp_min(1e-12)
+        assert float(error) < 0.3, name  # 1 / sqrt(150 * 0.3 / 0.7) = 0.12 for one tile
+
+
+def test_what_is_not_traced_at_a_test_view_is_the_diffuse_colour():
+    method, made = in_second_stage(recipe(traced=TracedShareSettings(threshold=0.5)))
+    with torch.no_grad():
+        rendered = method.render(made.scene.test[0].camera, 15, RenderOptions(layers=True))
+    assert rendered.layers is not None
+    assert not bool(rendered.layers.traced.any())  # k_s starts at 0.001
+    assert torch.equal(rendered.image, rendered.layers.diffuse)
+
+
+@pytest.mark.parametrize("traced", [TracedShareSettings(), SAMPLED])
+def test_state_goes_round_in_the_middle_of_the_second_stage(traced: TracedShareSettings):
+    method, made = in_second_stage(recipe(traced=traced), steps=17)
+    state = {name: tensor.clone() for name, tensor in method.state().items()}
+    other = new_method(recipe(traced=traced), made, schedule())
+    other.load(state)
+    for step in range(32, 55):  # both density controls, a propagation, resets
+        train_step(method, made, step)
+        train_step(other, made, step)
+    assert method.state().keys() == other.state().keys()
+    different = [name for name, tensor in method.state().items() if not torch.equal(tensor, other.state()[name])]
+    assert different == []
+
+
+SCRIPT = """
+import sys
+from pathlib import Path
+import torch
+from reflective_cases import SAMPLED, new_method, recipe, schedule, tiny
+from rtgs.train.trainer import Trainer
+torch.set_num_threads(1)
+made = tiny()
+method = new_method(recipe(traced=SAMPLED), made, schedule())
+for stage in method.stages:
+    trainer = Trainer(method, made.scene, seed=3, stage=stage, checkpoint_dir=Path(sys.argv[1]))
+    after_step = method.after_step
+    def telling(step, after_step=after_step):
+        events = after_step(step)
+        print("step", step, flush=True)
+        return events
+    method.after_step = telling
+    trainer.run()
+    method.after_step = after_step
+"""
+
+
+def test_killed_in_the_second_stage_it_ends_with_the_same_bits(tmp_path: Path):
+    settings, plan, made = recipe(traced=SAMPLED), schedule(), tiny()
+    train_all(settings, made, plan, folder=tmp_path / "straight")
+    path = os.pathsep.join([str(TESTS.parents[1]), str(TESTS), os.environ.get("PYTHONPATH", "")])
+    command = [sys.executable, "-c", SCRIPT, str(tmp_path / "killed")]
+    process = subprocess.Popen(command, env=os.environ | {"PYTHONPATH": path}, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    for line in process.stdout:
+        if line == "step 44\n":
+            time.sleep(0.003)
+            process.send_signal(signal.SIGKILL)
+            break
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL
+    method = new_method(settings, made, plan)
+    stage = method.stages[1]
+    resumed = Trainer(method, made.scene, seed=3, stage=stage, checkpoint_dir=tmp_path / "killed").run().resumed_from
+    assert resumed in {40, 50, 60}
+    ends = [load_file(checkpoint_path(tmp_path / name, 60) / "state.safetensors") for name in ("straight", "killed")]
+    assert ends[0].keys() == ends[1].keys()
+    assert [name for name in ends[0] if not torch.equal(ends[0][name], ends[1][name])] == []
+
+
+def test_a_matte_scene_is_recognised_before_anything_can_hurt_it_and_goes_on_as_in_stage_one(tmp_path: Path):
+    matte = MatteSettings(probation=0.05, views=3)
+    made = tiny(strength=0.0)
+    method = new_method(recipe(matte=matte), made, schedule())
+    method.begin(method.stages[1])
+    kinds = []
+    for step in range(15, 40):
+        _, events = train_step(method, made, step)
+        kinds += [(step + 1, event.kind) for event in events if event.kind in ("decision", "propagation")]
+    assert kinds == [(18, "decision")]
+    assert method.sets == (method.base,)
+    assert not isinstance(method.base.surfels, MaterialSurfels)
+    assert method.decisions[-1].what == "the reflection stage ended early"
+    assert "nothing specular in this scene" in method.decisions[-1].why
+    other = new_method(recipe(matte=matte), made, schedule())
+    other.load({name: tensor.clone() for name, tensor in method.state().items()})
+    assert other.decisions[-1] == method.decisions[-1]
+    for step in range(40, 45):
+        train_step(method, made, step)
+        train_step(other, made, step)
+    assert all(torch.equal(tensor, other.state()[name]) for name, tensor in method.state().items())
+
+
+def test_propagation_makes_opaque_grows_and_disturbs_as_envgs_does():
+    quiet = PropagationSettings(every=20, until=0.9, hold_every=5)
+    method, made = in_second_stage(recipe(propagation=quiet))
+    with torch.no_grad():
+        method.base.surfels.specular_logits[:50] = 2.0
+    for step in range(15, 19):
+        train_step(method, made, step)
+    before = method.base.surfels.detached()
+    _, events = train_step(method, made, 19)
+    assert "propagation" in [event.kind for event in events]
+    assert float(method.base.surfels.opacity_logits.detach().sigmoid().min()) >= 0.9 - 1e-6
+    if len(before) == len(method.base.surfels):
+        grown = (method.base.surfels.log_scales - before.log_scales)[:50].detach()
+        assert float(grown.median()) == pytest.approx(0.405, abs=0.05)
+    held = method.base.surfels.opacity_logits.detach().clone()
+    train_step(method, made, 20)
+    assert torch.equal(method.base.surfels.opacity_logits.detach(), held)
+
+
+def test_specular_resets_lower_the_weight_with_the_opacity():
+    method, made = in_second_stage()
+    with torch.no_grad():
+        method.base.surfels.specular_logits.fill_(3.0)
+    for step in range(15, 40):
+        train_step(method, made, step)
+    assert float(method.base.surfels.specular_logits.detach().sigmoid().max()) <= 1.0001e-3  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("name", ["rtgs", "envgs"])
+@pytest.mark.parametrize("steps", [400, pytest.param(5000, marks=pytest.mark.slow)])
+def test_learning_rates_times_ten_stay_finite(name: str, steps: int):
+    settings = recipe(name)
+    rates = {field.name: 10 * getattr(settings.optimizer, field.name) for field in fields(settings.optimizer)[:10]}
+    settings = replace(settings, optimizer=replace(settings.optimizer, **rates))
+    made = tiny()
+    noise = torch.Generator().manual_seed(5)
+    views = tuple(replace(v, image=torch.rand(v.image.shape, generator=noise)) for v in made.scene.train)
+    made = replace(made, scene=replace(made.scene, train=views))
+    plan = schedule(steps, densify_until=steps // 2, densify_every=50, opacity_reset_every=steps // 4)
+    method = train_all(settings, made, plan)
+    for part in method.sets:
+        for key, tensor in part.surfels.items():
+            assert bool(torch.isfinite(tensor).all()), f"{part.name}.{key}"
+    with torch.no_grad():
+        image = method.render(made.scene.test[0].camera, steps, RenderOptions()).image
+    assert bool(torch.isfinite(image).all())
