@@ -33,10 +33,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from benchmarks.machine import machine, peak_memory_mb
+from benchmarks.machine import machine
 from benchmarks.speed_error_plot import GRADIENT_BOUND, PICTURE_BOUND, draw
 from benchmarks.trace_levers import defaults, lever_figures
 from benchmarks.trace_levers_plot import draw_levers
+from benchmarks.training_runs import schedule_overrides, train_run
 from benchmarks.yardstick_scene import HEIGHT, SCALES, WIDTH, made_arrays
 from rtgs.cameras import Camera
 from rtgs.native import core
@@ -192,71 +193,14 @@ def kernel_figures(count: int, width: int, rounds: int, full: bool) -> dict[str,
     return {"surfels": count, "image": size, "channels": 12, "rounds": rounds, "flagged_share": flagged, "paths": paths}
 
 
-def schedule_overrides(steps: int) -> list[str]:
-    """The quick preset's schedule shrunk to ``steps``: intervals of density control stay, boundaries move."""
-    from rtgs.config.compose import compose
-
-    schedule = compose([f"preset={PRESET}"])[0].schedule
-    share = steps / schedule.total
-
-    def hundreds(value: int) -> int:
-        return max(100, 100 * round(share * value / 100))
-
-    values = {
-        "total": steps,
-        "means_lr_steps": steps,
-        "sh_every": max(1, round(share * schedule.sh_every)),
-        "densify_from": hundreds(schedule.densify_from),
-        "densify_until": hundreds(schedule.densify_until),
-    }
-    return [f"schedule.{name}={value}" for name, value in values.items()]
-
-
 def train(scene_name: str, steps: int, cap: int, long_side: int | None) -> TrainingPoint:
     """Train one point of the sweep with the trainer that ``rtgs run`` uses, and score the held-out views."""
-    from dataclasses import replace
-
-    from rtgs.config.compose import compose
-    from rtgs.evaluate.metrics import psnr, ssim
-    from rtgs.methods import RenderOptions, create_method
-    from rtgs.scenes.scene import load_scene
-    from rtgs.train.seeds import generator_for
-    from rtgs.train.trainer import Trainer
-
-    overrides = [f"scene={scene_name}", f"method={METHOD}", f"preset={PRESET}", *schedule_overrides(steps)]
-    config, _ = compose([*overrides, f"method.density.max_surfels={cap}"])
-    scene = load_scene(config.scene if long_side is None else replace(config.scene, long_side=long_side))
-    reset_peak_memory()
-    method = create_method(config.method, scene, config.schedule, generator_for(config.seed, "initialise"))
-    trainer = Trainer(method, replace(scene, test=()), seed=config.seed)  # no test views: their time is not training
-    start = time.process_time()
-    summary = trainer.run()
-    cpu_seconds = time.process_time() - start
-    peak = run_peak_memory_mb()
-    with torch.no_grad():
-        renders = [method.render(view.camera, steps, RenderOptions()).image.clamp(0, 1) for view in scene.test]
-    scores = [(float(psnr(r, v.image)), float(ssim(r, v.image))) for r, v in zip(renders, scene.test, strict=True)]
-    psnr_mean, ssim_mean = (statistics.fmean(column) for column in zip(*scores, strict=True))
-    seconds = (round(cpu_seconds, 2), round(summary.seconds, 2))
-    quality = (round(psnr_mean, 3), round(ssim_mean, 4))
-    return TrainingPoint(scene_name, steps, cap, summary.surfels, *seconds, *quality, round(peak))
-
-
-def reset_peak_memory() -> None:
-    """Let the kernel count this process's largest resident size anew, where it can (Linux)."""
-    try:
-        Path("/proc/self/clear_refs").write_text("5")
-    except OSError:
-        return
-
-
-def run_peak_memory_mb() -> float:
-    """Largest resident size since :func:`reset_peak_memory`, or of the process so far where that cannot be told."""
-    try:
-        lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return peak_memory_mb()
-    return next((int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM")), peak_memory_mb())
+    overrides = [f"scene={scene_name}", f"method={METHOD}", f"preset={PRESET}", *schedule_overrides(steps, PRESET)]
+    run = train_run([*overrides, f"method.density.max_surfels={cap}"], long_side)
+    quality = run.quality()
+    psnr, ssim = (round(float(quality[name] or 0), digits) for name, digits in (("psnr", 3), ("ssim", 4)))
+    seconds = (round(run.cpu_seconds, 2), round(run.wall_seconds, 2))
+    return TrainingPoint(scene_name, steps, cap, run.summary.surfels, *seconds, psnr, ssim, round(run.peak_memory_mb))
 
 
 def sweep(steps: list[int], caps: list[int]) -> list[tuple[int, int]]:

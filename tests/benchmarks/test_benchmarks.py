@@ -23,6 +23,7 @@ from benchmarks import (
     trace_levers,
     trace_scene,
     train_step,
+    training_runs,
 )
 from rtgs.native import core
 
@@ -170,7 +171,7 @@ def test_speed_error(run, tmp_path: Path) -> None:
 
 
 def test_speed_error_shrinks_the_schedule() -> None:
-    overrides = dict(word.split("=") for word in speed_error.schedule_overrides(500))
+    overrides = dict(word.split("=") for word in training_runs.schedule_overrides(500, "quick"))
     assert overrides["schedule.total"] == overrides["schedule.means_lr_steps"] == "500"
     assert 100 <= int(overrides["schedule.densify_from"]) < int(overrides["schedule.densify_until"]) < 500
 
