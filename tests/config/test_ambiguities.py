@@ -1,0 +1,48 @@
+"""Every open question of the paper that concerns reflection is a config key (methods.md 10)."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+import pytest
+
+from rtgs.config import compose
+from rtgs.pipeline.fingerprint import flatten
+
+# Row of methods.md 10: the key that decides it, the decision of `method=rtgs preset=paper`, and the alternative kept.
+REGISTER: dict[int, list[tuple[str, object, object]]] = {
+    1: [("method.optics.weight", "microfacet", "literal")],
+    2: [("method.optics.remap", "pbrt", "none")],
+    3: [("method.optics.roughness_floor", 1e-3, 1e-4)],
+    4: [("method.optics.masking", "correlated", "separable")],
+    5: [("method.optics.max_gain", 16.0, 1.0)],
+    6: [
+        ("method.materials.f0_channels", 1, 3),
+        ("method.materials.f0", 0.04, 0.5),
+        ("method.materials.roughness", 0.005, 0.04),
+        ("method.optimizer.f0_logits", 0.005, 0.01),
+        ("method.optimizer.roughness_logits", 0.005, 0.01),
+    ],
+    7: [("method.render.depth_ratio", 0.0, 1.0)],
+    8: [("method.materials.normalized", True, False)],
+    10: [("method.loss.specular_target", 0.9, 1.0)],
+    20: [("method.loss.perceptual_form", "lpips", "vgg_l1")],
+    22: [("scene.resize_ratio", None, 0.125), ("scene.split_every", 8, 10)],
+    24: [("method.reflection.direction_gradient", "full", "last_sh")],
+    25: [("method.reflection.specular_reset", True, False)],
+    28: [("method.materials.specular", 1e-3, 0.1), ("schedule.sh_from", 0, 10_000)],
+}
+ENTRIES = [(row, *entry) for row, entries in REGISTER.items() for entry in entries]
+
+
+@pytest.fixture(scope="module")
+def decided() -> dict[str, object]:
+    config, _ = compose(["scene=demo", "method=rtgs", "preset=paper"])
+    return flatten(asdict(config))
+
+
+@pytest.mark.parametrize(("row", "key", "decision", "alternative"), ENTRIES)
+def test_a_row_is_a_key_with_the_decision_and_its_alternative(decided, row, key, decision, alternative):
+    assert decided[key] == decision, f"row {row}"
+    config, _ = compose(["scene=demo", "method=rtgs", "preset=paper", f"{key}={alternative}"])
+    assert flatten(asdict(config))[key] == alternative, f"row {row}"

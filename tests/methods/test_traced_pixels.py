@@ -1,0 +1,57 @@
+"""Which pixels are traced, and in which order."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from rtgs.methods.traced_pixels import choose_pixels, tile_order
+from rtgs.train.specular_settings import TracedShareSettings
+
+
+@pytest.mark.parametrize(("width", "height", "tile"), [(16, 8, 8), (13, 7, 4), (5, 3, 8), (40, 30, 16)])
+def test_the_order_visits_every_pixel_once_tile_by_tile(width: int, height: int, tile: int):
+    order = tile_order(width, height, tile)
+    assert torch.equal(order.index.sort().values, torch.arange(width * height))
+    assert bool((order.tile.diff() >= 0).all())
+    expected = (order.index // width // tile) * -(-width // tile) + order.index % width // tile
+    assert torch.equal(order.tile, expected)
+
+
+def test_sixteen_neighbours_of_the_order_are_a_block_of_the_image():
+    block = tile_order(16, 8, 8).index[:16]
+    assert set((block % 16).tolist()) == {0, 1, 2, 3}
+    assert set((block // 16).tolist()) == {0, 1, 2, 3}
+
+
+def test_pixels_without_a_surface_are_never_traced_and_high_ones_always():
+    generator = torch.Generator().manual_seed(0)
+    surface, showing = torch.rand(24, 32, generator=generator) > 0.3, torch.rand(24, 32, generator=generator)
+    settings = TracedShareSettings(threshold=0.6, share=0.25, tile=4)
+    high = (surface & (showing >= 0.6)).flatten()
+    shown = choose_pixels(surface, showing, settings, None)
+    assert torch.equal(shown.index.sort().values, high.nonzero()[:, 0])
+    assert shown.emphasis is None
+    trained = choose_pixels(surface, showing, settings, generator)
+    assert bool(surface.flatten()[trained.index].all())
+    assert set(high.nonzero()[:, 0].tolist()) <= set(trained.index.tolist())
+    assert trained.emphasis is not None
+    assert torch.equal(trained.emphasis == 1, high[trained.index])
+    assert torch.equal(trained.emphasis == 4, ~high[trained.index])
+    everything = choose_pixels(surface, showing, TracedShareSettings(threshold=0.0), generator)
+    assert len(everything.index) == int(surface.sum())
+
+
+def test_the_rest_is_drawn_in_whole_tiles_with_the_share_asked_for():
+    surface, showing = torch.ones(64, 64, dtype=torch.bool), torch.zeros(64, 64)
+    settings = TracedShareSettings(threshold=0.5, share=0.25, tile=8)
+    generator = torch.Generator().manual_seed(3)
+    counts = []
+    for _ in range(60):
+        chosen = choose_pixels(surface, showing, settings, generator)
+        drawn = torch.zeros(64 * 64)
+        drawn[chosen.index] = 1
+        tiles = drawn.reshape(8, 8, 8, 8).mean(dim=(1, 3))
+        assert bool(((tiles == 0) | (tiles == 1)).all())
+        counts.append(float(tiles.mean()))
+    assert sum(counts) / len(counts) == pytest.approx(0.25, abs=0.03)

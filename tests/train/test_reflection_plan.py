@@ -1,0 +1,80 @@
+"""When the second stage does what: EnvGS's schedule at its own length, and scaled."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from rtgs.config import compose
+from rtgs.train.schedule import (
+    base_densify_due,
+    densify_due,
+    opacities_held,
+    opacity_reset_due,
+    propagation_due,
+    reflection_plan,
+    reflection_reset_due,
+    sh_degree_at,
+)
+from rtgs.train.settings import ReflectionSettings
+from rtgs.train.specular_settings import PropagationSettings
+
+
+def paper(method: str):
+    config, _ = compose(["scene=demo", f"method={method}", "preset=paper"])
+    return config.method.reflection, reflection_plan(config.method.reflection, config.schedule)
+
+
+def test_the_papers_boundaries():
+    settings, plan = paper("rtgs")
+    assert (plan.start, plan.judged, plan.propagation_until) == (3000, 4000, 18000)
+    assert (plan.base.densify_until, plan.reflection.densify_until) == (20000, 21000)
+    steps = range(0, 25000, 100)
+    densified = [step for step in steps if densify_due(plan.reflection, step)]
+    assert densified == list(range(3500, 21000, 500))
+    assert [step for step in steps if reflection_reset_due(plan, step)] == [6000, 12000, 18000]
+    assert [step for step in steps if opacity_reset_due(plan.base, step)] == list(range(3000, 20000, 3000))
+    assert [step for step in steps if propagation_due(plan, settings, step)] == [
+        step for step in range(5000, 19000, 1000) if step % 3000
+    ]
+    assert [step for step in steps if base_densify_due(plan, settings, step)][:28] == [
+        *range(600, 3100, 100),
+        3500,
+        4000,
+        4500,
+    ]
+    assert base_densify_due(plan, settings, 18100)
+    assert sh_degree_at(plan.reflection, 2999, 3) == 0
+    assert sh_degree_at(plan.reflection, 4000, 3) == 1
+
+
+def test_opacities_stand_still_from_a_propagation_to_the_next_multiple_of_200():
+    settings, plan = paper("rtgs")
+    held = [step for step in range(4900, 6100) if opacities_held(plan, settings, step)]
+    assert held == list(range(5000, 5200))
+    off = replace(settings, propagation=replace(settings.propagation, every=0))
+    assert not any(opacities_held(plan, off, step) for step in range(4900, 6100))
+
+
+def test_envgs_has_the_shares_of_its_own_run():
+    settings, plan = paper("envgs")
+    assert (plan.start, plan.reflection.densify_until, plan.propagation_until) == (3000, 21000, 18000)
+    assert settings.direction_gradient == "full"
+
+
+@pytest.mark.parametrize("total", [20, 2000, 60000])
+def test_boundaries_scale_with_the_run(total: int):
+    config, _ = compose(["scene=demo", f"schedule.total={total}"])
+    plan = reflection_plan(ReflectionSettings(), replace(config.schedule, total=total))
+    assert plan.start == round(0.05 * total)
+    assert plan.reflection.densify_until == round(0.35 * total)
+    assert plan.start < plan.judged <= plan.start + max(1, round(total / 60))
+
+
+def test_nothing_that_hurts_happens_before_the_scene_is_judged():
+    settings = ReflectionSettings(propagation=PropagationSettings(every=10), opacity_reset_every=10)
+    config, _ = compose(["scene=demo", "schedule.total=6000"])
+    plan = reflection_plan(settings, config.schedule)
+    early = range(plan.start, plan.judged + 1)
+    assert not any(propagation_due(plan, settings, step) or reflection_reset_due(plan, step) for step in early)
