@@ -77,6 +77,7 @@ STEP = StepKind(
         "rtgs.scenes.scene",
         "rtgs.scenes.images",
         "rtgs.scenes.truth",
+        "rtgs.scenes.synthetic.record",
         "rtgs.scenes.points",
         "rtgs.scenes.splits",
         "rtgs.scenes.undistort",

@@ -71,13 +71,13 @@ def synthesize(params: SynthesizeParams, context: StepContext) -> None:
 
 
 _MODULES = (
-    "assemble", "capture", "colmap_text", "description", "features", "geometry", "layers", "monocular", "noise",
-    "record", "render", "sculpt", "textures", "viewpoints",
+    "assemble", "capture", "colmap_text", "description", "features", "geometry", "layers", "lightmap", "monocular",
+    "noise", "record", "render", "sculpt", "textures", "viewpoints",
 )  # fmt: skip
 
 STEP = StepKind(
     "synthesize",
-    1,
+    2,
     synthesize,
     helpers=("rtgs.scenes.truth", *(f"rtgs.scenes.synthetic.{module}" for module in _MODULES)),
 )

@@ -26,7 +26,7 @@ def write_experiment_table(runs: Sequence[tuple[RunConfig, Sequence[StepResult]]
     measured = []
     for one, results in asked:
         evaluation = evaluation_of(results)
-        scene = evaluation.facts.scene
+        scene = one.scene.name  # not the table's name of it, which says what is a stand-in
         measured.append(Measured(evaluation, one.seed, names.get(scene, scene)))
     preset = measured[0].evaluation.facts.preset
     spec = TableSpec(config.table.name, config.table.title or config.table.name, config.table.data)

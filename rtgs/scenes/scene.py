@@ -27,6 +27,7 @@ from rtgs.scenes.importers import read_capture
 from rtgs.scenes.points import camera_extent, filter_points, random_points, too_few_points
 from rtgs.scenes.settings import CaptureError, SceneSettings
 from rtgs.scenes.splits import choose_split
+from rtgs.scenes.synthetic.record import CaptureRecord
 from rtgs.scenes.truth import ViewTruth, read_truth
 from rtgs.scenes.undistort import Lens, undistort_image, undistort_nearest
 
@@ -129,14 +130,15 @@ def load_scene(settings: SceneSettings) -> Scene:
     extent = camera_extent(np.array([by_name[name].center for name in split.train]).reshape(-1, 3))
     used = [by_name[name] for name in (*split.train, *split.test)]
     points, point_source = _scene_points(capture, settings, used, extent)
+    record = CaptureRecord.read(capture.root)
     scene = Scene(
-        name=settings.name,
+        name=record.labelled(settings.name) if record else settings.name,
         train=tuple(load_view(by_name[name], settings) for name in split.train),
         test=tuple(load_view(by_name[name], settings, with_truth=True) for name in split.test),
         points=torch.from_numpy(points.positions.astype(np.float32)),
         point_colors=torch.from_numpy(points.colors.astype(np.float32)),
         extent=extent,
-        source=f"{capture.format}; test views: {split.rule}; points: {point_source}",
+        source=f"{capture.format}; test views: {split.rule}; points: {point_source}{record.origin if record else ''}",
     )
     log.info("%s", scene.summary())
     return scene

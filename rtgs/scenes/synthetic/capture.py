@@ -25,6 +25,7 @@ from rtgs.scenes.synthetic.colmap_text import write_colmap_text
 from rtgs.scenes.synthetic.description import SceneDescription
 from rtgs.scenes.synthetic.features import PictureView, feature_points
 from rtgs.scenes.synthetic.layers import LightLayers
+from rtgs.scenes.synthetic.lightmap import LightmapSettings
 from rtgs.scenes.synthetic.monocular import perturbed_normals, shrunk_normals
 from rtgs.scenes.synthetic.noise import noise_of_mean
 from rtgs.scenes.synthetic.record import CaptureRecord, ViewRecord, noise_psnrs, reflected_share, weighted_share
@@ -73,7 +74,7 @@ def write_capture(
         OSError: a file cannot be written (disk full); finished views stay in ``work``.
     """
     settings = settings or CaptureSettings()
-    tracer = PathTracer(description, settings.seed, variant)
+    tracer = PathTracer(description, settings.seed, variant, LightmapSettings() if settings.lightmap else None)
     views = make_cameras(description.viewpoints, settings.width, settings.height, settings.seed)
     for leftover in work.glob("*.tmp"):
         shutil.rmtree(leftover)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rtgs.scenes.synthetic.description import Shape
+from rtgs.scenes.synthetic.description import Part, Shape
 from rtgs.scenes.synthetic.sculpt import sculpt
 
 Array = NDArray[np.float64]
@@ -66,7 +66,7 @@ def lathe(profile: tuple[tuple[float, float], ...], arc: float = 360.0, columns:
     return _grid_mesh(points, normals)
 
 
-def sphere(radius: float, rows: int = 64, columns: int = 128) -> Mesh:
+def sphere(radius: float, rows: int = 96, columns: int = 192) -> Mesh:
     polar = np.linspace(np.pi, 0, rows)[:, None]
     angle = np.linspace(0, 2 * np.pi, columns)
     unit = np.stack((np.sin(polar) * np.cos(angle), np.sin(polar) * np.sin(angle), np.cos(polar) + 0 * angle), -1)
@@ -88,21 +88,21 @@ def knot(scale: float, rows: int = 400, columns: int = 32, p: int = 2, q: int = 
     return _grid_mesh(scale * (center[:, None] + 0.17 * normal), normal, flip=True)
 
 
-def plane(half: tuple[float, float, float]) -> Mesh:
-    """A rectangle in x, y facing +z."""
-    x, y = np.meshgrid((-half[0], half[0]), (-half[1], half[1]))
+def plane(half: tuple[float, float, float], cells: int = 48) -> Mesh:
+    """A rectangle in x, y facing +z, in cells x cells squares: light is kept at vertices."""
+    x, y = np.meshgrid(*(np.linspace(-h, h, cells + 1) for h in half[:2]))
     points = np.stack((x, y, np.zeros_like(x)), -1)
     return _grid_mesh(points, np.broadcast_to((0.0, 0.0, 1.0), points.shape).copy())
 
 
-def box(half: tuple[float, float, float], inward: bool = False) -> Mesh:
-    """A box; each face has the whole UV square. ``inward`` turns it into a room."""
+def box(half: tuple[float, float, float], inward: bool = False, cells: int = 32) -> Mesh:
+    """A box, each face in cells x cells squares over the whole UV square. ``inward`` turns it into a room."""
     sides = []
     for axis in range(3):
         for sign in (-1.0, 1.0):
             u, v = (axis + 1) % 3, (axis + 2) % 3
-            grid_u, grid_v = np.meshgrid((-half[u], half[u]), (-half[v], half[v]))
-            points = np.zeros((2, 2, 3))
+            grid_u, grid_v = np.meshgrid(*(np.linspace(-half[k], half[k], cells + 1) for k in (u, v)))
+            points = np.zeros((cells + 1, cells + 1, 3))
             points[..., axis], points[..., u], points[..., v] = sign * half[axis], grid_u, grid_v
             normal = np.zeros(3)
             normal[axis] = -sign if inward else sign
@@ -123,11 +123,11 @@ def dome(radius: float, rows: int = 48, columns: int = 128) -> Mesh:
     return _grid_mesh(radius * unit, -unit, flip=True)
 
 
-def kernels(shape: Shape, lumps: int = 6, rows: int = 9, columns: int = 14) -> Mesh:
-    """A heap of irregular kernels inside the profile: each some overlapping small balls."""
+def kernels(shape: Shape, forms: int = 6, lumps: int = 6) -> Mesh:
+    """A heap of irregular kernels inside the profile: a few forms, each some balls grown together, turned at random."""
     rng = np.random.default_rng(shape.count)
     profile = np.asarray(shape.profile, float)
-    ball = sphere(1.0, rows, columns)
+    templates = [box_mapped(*sculpt(_kernel(shape.size[0], lumps, rng))) for _ in range(forms)]
     heights = np.linspace(profile[0, 1], profile[-1, 1], 64)
     radii = np.interp(heights, profile[:, 1], profile[:, 0])
     volume = np.cumsum(radii**2) / np.sum(radii**2)
@@ -137,12 +137,22 @@ def kernels(shape: Shape, lumps: int = 6, rows: int = 9, columns: int = 14) -> M
         reach = np.interp(height, heights, radii)
         angle, distance = 2.39996 * number + rng.normal(0, 0.3), reach * rng.random() ** 0.3
         center = np.array((distance * np.cos(angle), distance * np.sin(angle), height))
-        for _ in range(lumps):
-            offset = rng.normal(0, 1, 3)
-            offset *= rng.uniform(0.35, 0.75) * shape.size[0] / np.linalg.norm(offset)
-            vertices = ball.vertices * shape.size[0] * rng.uniform(0.3, 0.6) + center + offset
-            meshes.append(Mesh(vertices, ball.normals, ball.uvs * 0.2 + rng.random(2), ball.faces))
+        form = templates[number % forms]
+        turned = _rotation(rng.uniform(0, 360), rng.uniform(0, 360))
+        vertices, normals = form.vertices @ turned.T + center, form.normals @ turned.T
+        meshes.append(Mesh(vertices, normals, form.uvs + rng.random(2), form.faces))
     return merge(meshes)
+
+
+def _kernel(radius: float, lumps: int, rng: np.random.Generator) -> Shape:
+    """Balls around a middle, within 1.3 ``radius``."""
+    parts = [Part(size=(0.5 * radius,) * 3)]
+    for _ in range(lumps):
+        offset = rng.normal(0, 1, 3)
+        offset *= rng.uniform(0.5, 0.8) * radius / np.linalg.norm(offset)
+        place = (float(offset[0]), float(offset[1]), float(offset[2]))
+        parts.append(Part(position=place, size=(rng.uniform(0.35, 0.5) * radius,) * 3, blend=0.15 * radius))
+    return Shape("kernel", "sculpt", parts=tuple(parts), cell=0.11 * radius)
 
 
 def box_mapped(vertices: Array, normals: Array, faces: NDArray[np.int32]) -> Mesh:
@@ -203,12 +213,17 @@ def build(shape: Shape) -> Mesh:
     return merge([Mesh(vertices + np.asarray(place), normals, mesh.uvs, mesh.faces) for place in places])
 
 
-def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
-    """``count`` points uniform by area, (count, 3), and their UVs (count, 2)."""
+def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> tuple[Array, Array, Array]:
+    """``count`` points uniform by area, (count, 3), their UVs (count, 2) and the unit normals of their faces."""
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    cross = np.cross(b - a, c - a)
+    area = np.linalg.norm(cross, axis=1)
     face = rng.choice(len(area), size=count, p=area / area.sum())
     r1, r2 = np.sqrt(rng.random((count, 1))), rng.random((count, 1))
     weights = np.concatenate((1 - r1, r1 * (1 - r2), r1 * r2), 1)[..., None]
     corners = mesh.faces[face]
-    return (weights * mesh.vertices[corners]).sum(1), (weights * mesh.uvs[corners]).sum(1)
+    return (
+        (weights * mesh.vertices[corners]).sum(1),
+        (weights * mesh.uvs[corners]).sum(1),
+        cross[face] / area[face, None],
+    )

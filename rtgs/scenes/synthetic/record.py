@@ -64,10 +64,15 @@ class CaptureRecord:
     reflected_in_mask: float | None
     reflected_in_specular: float | None
 
+    def labelled(self, name: str) -> str:
+        """How tables, pages and logs name the scene: nobody may take a stand-in for a paper's data."""
+        return f"{name} (stand-in)" if self.stand_in_for else name
+
     @property
-    def label(self) -> str:
-        """How tables name it."""
-        return f"{self.name} (stand-in)" if self.stand_in_for else self.name
+    def origin(self) -> str:
+        """An addition to what is said of where a scene came from."""
+        stand_in = f", stand-in for {self.stand_in_for}, not its data" if self.stand_in_for else ""
+        return f"; path traced ({self.renderer}){stand_in}"
 
     def write(self, folder: Path) -> None:
         """Write ``synthetic.json``."""

@@ -15,6 +15,7 @@ from rtgs.scenes.synthetic.assemble import scene_of
 from rtgs.scenes.synthetic.description import SceneDescription
 from rtgs.scenes.synthetic.geometry import Mesh, build
 from rtgs.scenes.synthetic.layers import FirstSurface, LightLayers
+from rtgs.scenes.synthetic.lightmap import ATTRIBUTE, LightmapSettings, LitSurfaces, bake
 from rtgs.scenes.synthetic.variants import load_mitsuba
 
 LANES = 1 << 20  # samples in flight: bounds the memory of the vectorised variant to a few hundred MB
@@ -35,12 +36,21 @@ class Geometry:
 class PathTracer:
     """One described scene, ready to be seen from any camera."""
 
-    def __init__(self, description: SceneDescription, seed: int = 0, variant: str | None = None) -> None:
+    def __init__(
+        self,
+        description: SceneDescription,
+        seed: int = 0,
+        variant: str | None = None,
+        lightmap: LightmapSettings | None = None,
+    ) -> None:
         self.description = description
         self.seed = seed
+        self.lightmap = lightmap  # None: every path of every view is traced to its end; so in the scalar variant
         self._mi = load_mitsuba(variant)
         self.variant = str(self._mi.variant())
-        self.renderer = f"Mitsuba {self._mi.__version__}, {self.variant}"
+        if "scalar" in self.variant:
+            self.lightmap = None  # one ray after the other: a map would take longer than the pictures
+        self.renderer = f"Mitsuba {self._mi.__version__}, {self.variant}{', light map' if self.lightmap else ''}"
         self.meshes: dict[str, Mesh] = {shape.name: build(shape) for shape in description.shapes}
 
     def image(self, camera: Camera, samples: int) -> NDArray[np.float32]:
@@ -141,7 +151,13 @@ class PathTracer:
         thin = any(shape.material.kind == "thin_glass" for shape in self.description.shapes)
         kind = {"type": "volpath" if thin else "path"}
         integrator = self._mi.load_dict(kind | {"max_depth": MAX_DEPTH, "rr_depth": RUSSIAN_ROULETTE_DEPTH})
-        return FirstSurface(self._mi, self._scene, integrator)
+        if self.lightmap is None:
+            return FirstSurface(self._mi, self._scene, integrator)
+        meshes = list(self.meshes.values())
+        light = bake(self._mi, self._scene, meshes, integrator, self.lightmap, self.seed)
+        for shape, values in zip(self._scene.shapes(), light):
+            shape.add_attribute(ATTRIBUTE, 3, values.astype(np.float32).ravel())
+        return LitSurfaces(self._mi, self._scene)
 
 
 def _sampler(mi: Any, samples: int) -> Any:

@@ -33,9 +33,12 @@ class CaptureSettings:
 
     width: int = 256
     height: int = 192
-    samples: int = 48
+    lightmap: bool = True
+    """Light on matte surfaces is path-traced once for the scene, not for every view: a twentieth of the time, see
+    :mod:`rtgs.scenes.synthetic.lightmap`. Not in Mitsuba's scalar variant, which traces every path to its end."""
+    samples: int = 16
     """Paths a pixel of training views."""
-    test_samples: int = 192
+    test_samples: int = 32
     """Paths a pixel of test views, rendered as two halves that measure their noise."""
     test_every: int = 8
     """Views whose index is divisible by it are test views, as the importer splits them (methods.md 8.1)."""
@@ -45,7 +48,7 @@ class CaptureSettings:
     """Of training images, without chroma subsampling; test images are PNG."""
     normal_tilt: float = 6.0
     """Degrees, smooth error of the monocular normals."""
-    normal_noise: float = 1.0
+    normal_noise: float = 0.0
     """Degrees, white error of the monocular normals."""
     normal_scale: float = 0.5
     """Size of the monocular normal maps, times that of the images."""

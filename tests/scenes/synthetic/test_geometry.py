@@ -43,7 +43,8 @@ def test_room_normals_point_inward():
 
 def test_samples_lie_on_the_surface_and_are_uniform():
     rng = np.random.default_rng(0)
-    points, _ = sample_surface(build(Shape("s", "sphere", size=(2.0, 0, 0))), 20_000, rng)
+    points, _, normals = sample_surface(build(Shape("s", "sphere", size=(2.0, 0, 0))), 20_000, rng)
+    np.testing.assert_allclose((normals * points).sum(1), 2.0, atol=0.01)  # unit and outward
     np.testing.assert_allclose(np.linalg.norm(points, axis=1), 2.0, atol=5e-3)
     assert np.abs(points.mean(0)).max() < 0.05  # uniform: no bias to a pole
     assert np.mean(points[:, 2] > 1.0) == pytest.approx(0.25, abs=0.015)  # a cap of height R/2 holds a quarter
