@@ -7,7 +7,7 @@ namespace rtgs::RTGS_ISA {
 namespace {
 
 constexpr int kMostChannels = 48;      // features and colours, padded
-constexpr int kMostCoefficients = 48;  // of sh_rest, padded
+constexpr int kMostCoefficients = 48;  // of sh_rest, padded; the same, for the masks
 constexpr int padded(int floats) { return (floats + kLanes - 1) / kLanes * kLanes; }
 
 struct RowLayout {
@@ -25,10 +25,29 @@ struct alignas(64) RayRow {
   float pattern[kMostCoefficients];       // colour c at 3 k + c
 };
 
+// Bits of a ray row that stay where some colours of a surfel are clamped at zero; by those colours, a bit each.
+struct alignas(64) ColorMasks {
+  uint32_t channels[8][kMostChannels], coefficients[8][kMostCoefficients];
+  explicit ColorMasks(int features) {
+    for (int clamped = 0; clamped < 8; ++clamped) {
+      for (int c = 0; c < kMostChannels; ++c)
+        channels[clamped][c] = c >= features && c < features + 3 && clamped >> (c - features) & 1 ? 0 : ~0u;
+      for (int c = 0; c < kMostCoefficients; ++c) coefficients[clamped][c] = clamped >> (c % 3) & 1 ? 0 : ~0u;
+    }
+  }
+};
+
+struct SurfelHits {  // of one packet on one surfel
+  uint32_t lanes;
+  bool clamped;                // any colour of any hit
+  alignas(64) float weights[kLanes];
+  uint8_t clamped_colors[kLanes];  // where clamped
+};
+
 class PacketBackward {
  public:
-  PacketBackward(const TraceBackwardArgs& args, TraceWorkspace& work, int64_t packet, int part)
-      : args_(args), work_(work), tape_(args.tapes[packet]), layout_(args.surfels), part_(part),
+  PacketBackward(const TraceBackwardArgs& args, TraceWorkspace& work, const ColorMasks& masks, int64_t packet, int part)
+      : args_(args), work_(work), masks_(masks), tape_(args.tapes[packet]), layout_(args.surfels), part_(part),
         rays_(args.rays, packet) {
     for (int k = 0; k < 3; ++k) to_origin_[k] = to_direction_[k] = broadcast(0.f);
   }
@@ -56,15 +75,17 @@ class PacketBackward {
   void add_surfels();
   void geometry_sums(const float* s, const PlaneHit& hit, int32_t place, vmask met, vfloat w, vfloat* sums);
   float* destination(int32_t slot, bool& adds);
-  void sum_hits(const RayRow* const* rows, uint32_t hits, const float* weights, float* out, bool adds) const;
-  void add_direction(const RayRow* const* rows, uint32_t hits, const float* weights, int64_t id);
-  void unclamp(uint64_t clamped, uint32_t hits, const RayRow** rows);
+  template <bool kClamped>
+  vfloat sum_column(const SurfelHits& hits, const float* column, const uint32_t (*masks)[48]) const;
+  void sum_hits(const SurfelHits& hits, float* out, bool adds) const;
+  void add_direction(const SurfelHits& hits, uint32_t lanes, int64_t id);
   void write_rays();
 
   const float* record(int32_t slot) const { return args_.records + int64_t(kTraceFields) * slot; }
 
   const TraceBackwardArgs& args_;
   TraceWorkspace& work_;
+  const ColorMasks& masks_;
   const PacketTape& tape_;
   const RowLayout layout_;
   const int part_;
@@ -76,7 +97,7 @@ class PacketBackward {
   vfloat basis_[16];
   vint last_place_ = broadcast_int(-1);
   vfloat to_origin_[3], to_direction_[3];
-  RayRow ray_rows_[kLanes], unclamped_[kLanes];
+  RayRow ray_rows_[kLanes];
   alignas(64) float to_basis_[kLanes][kMostCoefficients];  // of the ray: gradient to its basis, at 3 k + c
 };
 
@@ -251,60 +272,70 @@ inline float* PacketBackward::destination(int32_t slot, bool& adds) {
 
 inline void put(float* out, vfloat v, bool adds) { store(out, adds ? load(out) + v : v); }
 
-// Sums of weight times ray row over the hits of one surfel.
-inline void PacketBackward::sum_hits(const RayRow* const* rows, uint32_t hits, const float* weights, float* out,
-                                     bool adds) const {
+// Sum of weight times one register of the ray rows; column: that register of the first ray's row.
+template <bool kClamped>
+inline vfloat PacketBackward::sum_column(const SurfelHits& hits, const float* column,
+                                         const uint32_t (*masks)[48]) const {
+  constexpr int kRowFloats = sizeof(RayRow) / sizeof(float);
+  vfloat sum = broadcast(0.f);
+  for (uint32_t left = hits.lanes; left; left &= left - 1) {
+    const int lane = __builtin_ctz(left);
+    vfloat values = load(column + lane * kRowFloats);
+    if (kClamped) values = (vfloat)((vint)values & load_int((const int32_t*)masks[hits.clamped_colors[lane]]));
+    sum = fma(broadcast(hits.weights[lane]), values, sum);
+  }
+  return sum;
+}
+
+inline void PacketBackward::sum_hits(const SurfelHits& hits, float* out, bool adds) const {
+  const RayRow& first = ray_rows_[0];
   for (int c = 0; c < layout_.channels; c += kLanes) {
-    vfloat sum = broadcast(0.f);
-    for (uint32_t left = hits; left; left &= left - 1) {
-      const int lane = __builtin_ctz(left);
-      sum = fma(broadcast(weights[lane]), load(rows[lane]->channels + c), sum);
-    }
+    const auto masks = (const uint32_t(*)[48])(masks_.channels[0] + c);
+    const vfloat sum = hits.clamped ? sum_column<true>(hits, first.channels + c, masks)
+                                    : sum_column<false>(hits, first.channels + c, masks);
     put(out + kTraceGradChannels + c, sum, adds);
   }
   for (int c = 0; c < layout_.coefficients; c += kLanes) {
-    vfloat sum = broadcast(0.f);
-    for (uint32_t left = hits; left; left &= left - 1) {
-      const int lane = __builtin_ctz(left);
-      sum = fma(broadcast(weights[lane]), load(rows[lane]->coefficients + c), sum);
-    }
+    const auto masks = (const uint32_t(*)[48])(masks_.coefficients[0] + c);
+    const vfloat sum = hits.clamped ? sum_column<true>(hits, first.coefficients + c, masks)
+                                    : sum_column<false>(hits, first.coefficients + c, masks);
     put(out + kTraceGradChannels + layout_.channels + c, sum, adds);
   }
 }
 
-inline void PacketBackward::add_direction(const RayRow* const* rows, uint32_t hits, const float* weights, int64_t id) {
+inline void PacketBackward::add_direction(const SurfelHits& hits, uint32_t lanes, int64_t id) {
   const float* values = args_.surfels.sh_rest + int64_t(3) * args_.surfels.rest * id;
   const int used = 3 * rest_count(args_.surfels.degree);
   for (int c = 0; c < layout_.coefficients; c += kLanes) {
     const vfloat value = load_first(values + c, used - c < kLanes ? used - c : kLanes);
-    for (uint32_t left = hits; left; left &= left - 1) {
+    for (uint32_t left = lanes; left; left &= left - 1) {
       const int lane = __builtin_ctz(left);
+      vfloat pattern = load(ray_rows_[lane].pattern + c);
+      if (hits.clamped) {
+        const uint32_t* mask = masks_.coefficients[hits.clamped_colors[lane]] + c;
+        pattern = (vfloat)((vint)pattern & load_int((const int32_t*)mask));
+      }
       float* sum = to_basis_[lane] + c;
-      store(sum, fma(weights[lane] * load(rows[lane]->pattern + c), value, load(sum)));
+      store(sum, fma(hits.weights[lane] * pattern, value, load(sum)));
     }
   }
 }
 
-// Rays whose colour at this surfel is clamped at zero get a row without that colour.
-void PacketBackward::unclamp(uint64_t clamped, uint32_t hits, const RayRow** rows) {
-  const int features = args_.surfels.feature_count(), used = 3 * rest_count(args_.surfels.degree);
-  for (; hits; hits &= hits - 1) {
-    const int lane = __builtin_ctz(hits);
-    if (!(clamped >> lane & 0x000100010001ull)) continue;
-    RayRow& row = unclamped_[lane];
-    row = ray_rows_[lane];
-    rows[lane] = &row;
-    for (int c = 0; c < 3; ++c) {
-      if (!(clamped >> (16 * c + lane) & 1)) continue;
-      row.channels[features + c] = 0.f;
-      for (int k = c; k < used; k += 3) row.coefficients[k] = row.pattern[k] = 0.f;
+inline SurfelHits surfel_hits(vmask met, vfloat w, uint64_t clamped) {
+  SurfelHits hits;
+  hits.lanes = mask_bits(met);
+  store(hits.weights, w);
+  hits.clamped = clamped != 0;
+  if (hits.clamped)
+    for (uint32_t left = hits.lanes; left; left &= left - 1) {
+      const int lane = __builtin_ctz(left);
+      const uint64_t bits = clamped >> lane;
+      hits.clamped_colors[lane] = uint8_t((bits & 1) | (bits >> 15 & 2) | (bits >> 30 & 4));
     }
-  }
+  return hits;
 }
 
 void PacketBackward::add_surfels() {
-  const RayRow *all_rows[kLanes], *some_rows[kLanes];
-  for (int lane = 0; lane < kLanes; ++lane) all_rows[lane] = &ray_rows_[lane];
   for (int k = 0; k < tape_.surfels; ++k) {
     if (args_.surfel_gradients && k + kTracePrefetch < tape_.surfels) {
       const float* row = args_.rows + int64_t(tape_.slots[k + kTracePrefetch]) * args_.row_stride;
@@ -318,25 +349,16 @@ void PacketBackward::add_surfels() {
     vfloat sums[kTraceGradChannels];
     geometry_sums(s, hit, place, met, w, sums);
 
-    const uint32_t hits = mask_bits(met);
-    alignas(64) float weights[kLanes];
-    store(weights, w);
-    const RayRow* const* rows = all_rows;
-    if (work_.clamped[k]) {
-      memcpy(some_rows, all_rows, sizeof some_rows);
-      unclamp(work_.clamped[k], hits, some_rows);
-      rows = some_rows;
-    }
+    const SurfelHits hits = surfel_hits(met, w, work_.clamped[k]);
     if (args_.surfel_gradients) {
       bool adds;
       float* out = destination(slot, adds);
       for (int c = 0; c < kTraceGradChannels; c += kLanes) put(out + c, settled(sums_of<>(sums + c)), adds);
-      sum_hits(rows, hits, weights, out, adds);
+      sum_hits(hits, out, adds);
     }
     if (args_.ray_gradients && layout_.coefficients) {
-      const uint32_t wanted =
-          args_.options.last_sh ? hits & mask_bits(eq_int(last_place_, broadcast_int(place))) : hits;
-      add_direction(rows, wanted, weights, tape_.ids[k]);
+      const uint32_t last = mask_bits(eq_int(last_place_, broadcast_int(place)));
+      add_direction(hits, args_.options.last_sh ? hits.lanes & last : hits.lanes, tape_.ids[k]);
     }
   }
 }
@@ -433,8 +455,9 @@ void trace_backward(const TraceBackwardArgs& args) {
 #pragma omp parallel for num_threads(threads) schedule(static, 1) if (threads > 1)
   for (int part = 0; part < threads; ++part) {
     TraceWorkspace& work = workspace_of(args.workspaces, part);
+    const ColorMasks masks(args.surfels.feature_count());
     for (int64_t packet = args.range_starts[part]; packet < args.range_starts[part + 1]; ++packet)
-      PacketBackward(args, work, packet, part).run();
+      PacketBackward(args, work, masks, packet, part).run();
   }
   if (threads > 1 && args.surfel_gradients) add_waiting(args);
 }
