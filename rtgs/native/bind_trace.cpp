@@ -75,7 +75,6 @@ class Tracing {
     RTGS_CALL(isa_, trace_records, surfels_.arrays, args.tree, options_.alpha_cutoff, records,
               m.slots.reserve(count + 1), options_.threads);
     args.records = records;
-    args.keep = keep;
     packets_ = (args.rays.count + RTGS_CALL(isa_, packet_lanes) - 1) / RTGS_CALL(isa_, packet_lanes);
     if (keep || out_weight_sum) args.tapes = m.tapes.reserve(packets_ + 1);
     std::vector<TapeArena> arenas = fresh_arenas(m.tape_blocks);

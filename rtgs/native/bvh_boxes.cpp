@@ -4,8 +4,8 @@
 
 namespace rtgs::RTGS_ISA {
 
-// Padded so that a hit which the tracer accepts lies inside in spite of rounding: in the plane of the surfel by a part of
-// its extent, off the plane by a part of its distance from the origin (the tracer pads by the ray's own distance).
+// Padded so that a hit which the tracer accepts lies inside in spite of rounding: in the plane of the surfel by a part
+// of its extent, off the plane by a part of its distance from the world's origin (the tracer pads by the ray's own).
 void surfel_boxes(const SurfelArrays& in, float alpha_cutoff, SurfelBox* boxes, int threads) {
   const int64_t groups = (in.count + kLanes - 1) / kLanes;
 #pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1)
@@ -14,7 +14,8 @@ void surfel_boxes(const SurfelArrays& in, float alpha_cutoff, SurfelBox* boxes, 
     const SurfelLanes s(in, first, alpha_cutoff);
     const vfloat radius = sqrt(max(s.reach, broadcast(0.f)));
     const vfloat mean[] = {s.mean.x, s.mean.y, s.mean.z};
-    const vfloat u[] = {s.tangent_u.x, s.tangent_u.y, s.tangent_u.z}, v[] = {s.tangent_v.x, s.tangent_v.y, s.tangent_v.z};
+    const vfloat u[] = {s.tangent_u.x, s.tangent_u.y, s.tangent_u.z};
+    const vfloat v[] = {s.tangent_v.x, s.tangent_v.y, s.tangent_v.z};
     const vfloat magnitude = max(max(abs(mean[0]), abs(mean[1])), abs(mean[2]));
     vfloat low[3], high[3];
     for (int k = 0; k < 3; ++k) {

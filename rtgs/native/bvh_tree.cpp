@@ -169,7 +169,8 @@ int32_t SurfelTree::build_node(const Range& range) {
   }
   for (int k = 0; k < count; ++k) {
     const int64_t surfels = parts[k].count();
-    const int32_t child = surfels <= kMostPerLeaf ? leaf_of(int32_t(parts[k].begin), int32_t(surfels)) : build_node(parts[k]);
+    const bool leaf = surfels <= kMostPerLeaf;
+    const int32_t child = leaf ? leaf_of(int32_t(parts[k].begin), int32_t(surfels)) : build_node(parts[k]);
     store_bounds(nodes_[index], k, parts[k].bounds);
     nodes_[index].child[k] = child;
   }

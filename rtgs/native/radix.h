@@ -14,7 +14,9 @@ constexpr int kMaxThreads = 64;  // of the sort: bounds the histograms, see sort
 struct Chunk {
   int64_t begin, end;
 };
-static inline Chunk chunk_of(int64_t count, int part, int parts) { return {count * part / parts, count * (part + 1) / parts}; }
+static inline Chunk chunk_of(int64_t count, int part, int parts) {
+  return {count * part / parts, count * (part + 1) / parts};
+}
 
 static inline int clipped_threads(int threads, int64_t count) {
   const int64_t useful = count / 4096 + 1;
@@ -23,7 +25,8 @@ static inline int clipped_threads(int threads, int64_t count) {
 }
 
 // One stable pass over an 11-bit digit. histograms: (threads, kDigits).
-static inline void radix_pass(const DepthKey* in, DepthKey* out, int64_t count, int shift, int threads, int64_t* histograms) {
+static inline void radix_pass(const DepthKey* in, DepthKey* out, int64_t count, int shift, int threads,
+                              int64_t* histograms) {
 #pragma omp parallel num_threads(threads) if (threads > 1)
   {
     const int parts = omp_get_num_threads(), part = omp_get_thread_num();

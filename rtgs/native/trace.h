@@ -84,8 +84,7 @@ struct TraceForwardArgs {
   TraceOptionsNative options;
   TreeView tree;
   const float* records;   // (N, kTraceFields)
-  bool keep;              // the tape is wanted
-  PacketTape* tapes;      // (packets) or null
+  PacketTape* tapes;      // (packets), or null where neither a backward pass nor the weights are wanted
   TapeArena* arenas;      // (threads)
   void** workspaces;      // (threads) made on first use, see free_trace_workspace
   // outputs, null when not wanted

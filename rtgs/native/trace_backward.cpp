@@ -1,48 +1,10 @@
 // Gradients of a packet from its tape (docs/tracer.md): responses surfel by surfel, the recursion along the rays row by
 // row, then all sums surfel by surfel, with rays as lanes and one transposed reduction per (surfel, packet). Surfels come
 // by ascending id, so that the sums of a ray do not depend on the tree.
-#include "trace_packet.h"
+#include "trace_rows.h"
 
 namespace rtgs::RTGS_ISA {
 namespace {
-
-constexpr int kMostChannels = 48;      // features and colours, padded
-constexpr int kMostCoefficients = 48;  // of sh_rest, padded; the same, for the masks
-constexpr int padded(int floats) { return (floats + kLanes - 1) / kLanes * kLanes; }
-
-struct RowLayout {
-  int channels, coefficients, floats;  // the first two padded to whole registers
-  explicit RowLayout(const TraceSurfels& s)
-      : channels(padded(s.feature_count() + s.colour_count())),
-        coefficients(s.sh_dc ? padded(3 * rest_count(s.degree)) : 0),
-        floats(kTraceGradChannels + channels + coefficients) {}
-};
-
-// Upstream gradients of one ray, as the rows of the surfels it hit want them. Every hit adds weight times this.
-struct alignas(64) RayRow {
-  float channels[kMostChannels];          // features, colours
-  float coefficients[kMostCoefficients];  // colour c times basis k, at 3 k + c
-  float pattern[kMostCoefficients];       // colour c at 3 k + c
-};
-
-// Bits of a ray row that stay where some colours of a surfel are clamped at zero; by those colours, a bit each.
-struct alignas(64) ColorMasks {
-  uint32_t channels[8][kMostChannels], coefficients[8][kMostCoefficients];
-  explicit ColorMasks(int features) {
-    for (int clamped = 0; clamped < 8; ++clamped) {
-      for (int c = 0; c < kMostChannels; ++c)
-        channels[clamped][c] = c >= features && c < features + 3 && clamped >> (c - features) & 1 ? 0 : ~0u;
-      for (int c = 0; c < kMostCoefficients; ++c) coefficients[clamped][c] = clamped >> (c % 3) & 1 ? 0 : ~0u;
-    }
-  }
-};
-
-struct SurfelHits {  // of one packet on one surfel
-  uint32_t lanes;
-  bool clamped;                // any colour of any hit
-  alignas(64) float weights[kLanes];
-  uint8_t clamped_colors[kLanes];  // where clamped
-};
 
 class PacketBackward {
  public:
@@ -76,7 +38,7 @@ class PacketBackward {
   void geometry_sums(const float* s, const PlaneHit& hit, int32_t place, vmask met, vfloat w, vfloat* sums);
   float* destination(int32_t slot, bool& adds);
   template <bool kClamped>
-  vfloat sum_column(const SurfelHits& hits, const float* column, const uint32_t (*masks)[48]) const;
+  vfloat sum_column(const SurfelHits& hits, const float* column, const uint32_t (*masks)[kMostColumns]) const;
   void sum_hits(const SurfelHits& hits, float* out, bool adds) const;
   void add_direction(const SurfelHits& hits, uint32_t lanes, int64_t id);
   void write_rays();
@@ -98,7 +60,7 @@ class PacketBackward {
   vint last_place_ = broadcast_int(-1);
   vfloat to_origin_[3], to_direction_[3];
   RayRow ray_rows_[kLanes];
-  alignas(64) float to_basis_[kLanes][kMostCoefficients];  // of the ray: gradient to its basis, at 3 k + c
+  alignas(64) float to_basis_[kLanes][kMostColumns];  // of the ray: gradient to its basis, at 3 k + c
 };
 
 // ---- upstream --------------------------------------------------------------------------------------------------
@@ -275,7 +237,7 @@ inline void put(float* out, vfloat v, bool adds) { store(out, adds ? load(out) +
 // Sum of weight times one register of the ray rows; column: that register of the first ray's row.
 template <bool kClamped>
 inline vfloat PacketBackward::sum_column(const SurfelHits& hits, const float* column,
-                                         const uint32_t (*masks)[48]) const {
+                                         const uint32_t (*masks)[kMostColumns]) const {
   constexpr int kRowFloats = sizeof(RayRow) / sizeof(float);
   vfloat sum = broadcast(0.f);
   for (uint32_t left = hits.lanes; left; left &= left - 1) {
@@ -290,13 +252,13 @@ inline vfloat PacketBackward::sum_column(const SurfelHits& hits, const float* co
 inline void PacketBackward::sum_hits(const SurfelHits& hits, float* out, bool adds) const {
   const RayRow& first = ray_rows_[0];
   for (int c = 0; c < layout_.channels; c += kLanes) {
-    const auto masks = (const uint32_t(*)[48])(masks_.channels[0] + c);
+    const auto masks = (const uint32_t(*)[kMostColumns])(masks_.channels[0] + c);
     const vfloat sum = hits.clamped ? sum_column<true>(hits, first.channels + c, masks)
                                     : sum_column<false>(hits, first.channels + c, masks);
     put(out + kTraceGradChannels + c, sum, adds);
   }
   for (int c = 0; c < layout_.coefficients; c += kLanes) {
-    const auto masks = (const uint32_t(*)[48])(masks_.coefficients[0] + c);
+    const auto masks = (const uint32_t(*)[kMostColumns])(masks_.coefficients[0] + c);
     const vfloat sum = hits.clamped ? sum_column<true>(hits, first.coefficients + c, masks)
                                     : sum_column<false>(hits, first.coefficients + c, masks);
     put(out + kTraceGradChannels + layout_.channels + c, sum, adds);
@@ -319,20 +281,6 @@ inline void PacketBackward::add_direction(const SurfelHits& hits, uint32_t lanes
       store(sum, fma(hits.weights[lane] * pattern, value, load(sum)));
     }
   }
-}
-
-inline SurfelHits surfel_hits(vmask met, vfloat w, uint64_t clamped) {
-  SurfelHits hits;
-  hits.lanes = mask_bits(met);
-  store(hits.weights, w);
-  hits.clamped = clamped != 0;
-  if (hits.clamped)
-    for (uint32_t left = hits.lanes; left; left &= left - 1) {
-      const int lane = __builtin_ctz(left);
-      const uint64_t bits = clamped >> lane;
-      hits.clamped_colors[lane] = uint8_t((bits & 1) | (bits >> 15 & 2) | (bits >> 30 & 4));
-    }
-  return hits;
 }
 
 void PacketBackward::add_surfels() {
@@ -368,7 +316,7 @@ void PacketBackward::write_rays() {
     for (vfloat& v : to_direction_) v = broadcast(0.f);
   if (layout_.coefficients) {
     const Direction d = rays_.unit_direction();
-    vfloat to_basis[kMostCoefficients];
+    vfloat to_basis[kMostColumns];
     for (vfloat& v : to_basis) v = broadcast(0.f);
     for (int k = 0; k < rest_count(args_.surfels.degree); ++k)
       for (int lane = 0; lane < kLanes; ++lane) {
@@ -390,55 +338,6 @@ void PacketBackward::write_rays() {
     direction = select(finite_upstream_, saturated(direction), direction);
     if (args_.out_origins) scatter(args_.out_origins + k, rays_.ray * 3, origin, rays_.exists);
     if (args_.out_directions) scatter(args_.out_directions + k, rays_.ray * 3, direction, rays_.exists);
-  }
-}
-
-// ---- threads -----------------------------------------------------------------------------------------------------
-// Ranges of about equal work: range_starts. And to which range each surfel's row belongs.
-void split_work(const TraceBackwardArgs& args) {
-  const int64_t packets = packet_count(args.rays);
-  const int threads = args.options.threads;
-  int64_t total = 0, done = 0;
-  const auto work = [&](int64_t p) { return int64_t(args.tapes[p].hits) + 8 * args.tapes[p].surfels; };
-  for (int64_t packet = 0; packet < packets; ++packet) total += work(packet);
-  int range = 0;
-  for (int64_t packet = 0; packet < packets; ++packet) {
-    while (range < threads && done * threads >= total * range) args.range_starts[range++] = packet;
-    done += work(packet);
-  }
-  while (range <= threads) args.range_starts[range++] = packets;
-  if (threads == 1 || !args.surfel_gradients) return;
-  memset(args.owners, 0x7f, size_t(args.surfels.arrays.count) * sizeof(int32_t));
-#pragma omp parallel for num_threads(threads) schedule(static, 1)
-  for (int part = 0; part < threads; ++part)
-    for (int64_t packet = args.range_starts[part]; packet < args.range_starts[part + 1]; ++packet)
-      for (int32_t k = 0; k < args.tapes[packet].surfels; ++k) {
-        int32_t* owner = args.owners + args.tapes[packet].slots[k];
-        int32_t before = __atomic_load_n(owner, __ATOMIC_RELAXED);
-        while (part < before &&
-               !__atomic_compare_exchange_n(owner, &before, part, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {
-        }
-      }
-}
-
-// Each thread takes a share of the slots, so that the order of additions to a row is that of the packets.
-void add_waiting(const TraceBackwardArgs& args) {
-  const int threads = args.options.threads;
-  const int64_t count = args.surfels.arrays.count;
-  const int floats = RowLayout(args.surfels).floats;
-#pragma omp parallel for num_threads(threads) schedule(static, 1)
-  for (int part = 0; part < threads; ++part) {
-    const int64_t begin = count * part / threads, end = count * (part + 1) / threads;
-    for (int range = 1; range < threads; ++range) {
-      TraceWorkspace& from = workspace_of(args.workspaces, range);
-      for (int64_t k = 0; k < from.waiting; ++k) {
-        const int64_t slot = from.waiting_slots[k];
-        if (slot < begin || slot >= end) continue;
-        const float* waiting = from.waiting_rows.data + args.row_stride * k;
-        float* row = args.rows + args.row_stride * slot;
-        for (int c = 0; c < floats; c += kLanes) store(row + c, load(row + c) + load(waiting + c));
-      }
-    }
   }
 }
 

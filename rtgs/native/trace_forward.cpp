@@ -1,5 +1,6 @@
-// Tracing, a packet of rays at a time (docs/tracer.md). Pending children of the tree wait ordered by the smallest t at
-// which a ray of the packet enters them; hits found are kept per lane. A hit nearer than the next pending child is final.
+// Tracing, a packet of rays at a time (docs/tracer.md). Pending children of the tree wait ordered by the smallest t
+// at which a ray of the packet enters them; hits found are kept per lane. A hit nearer than the next pending child is
+// final.
 // Hits of a lane are composited in the order of (t, surfel id), and per-ray sums over surfels run by ascending id, so
 // nothing depends on the shape of the tree.
 #if defined(_OPENMP)
@@ -38,7 +39,7 @@ class PacketTracer {
   void list_surfels();
   void sort_long_keys(int used);
   void write_channels();
-  template <int B>
+  template <int B, bool kHitsOnly = false>
   void sum_channels(int first);
   void write_colors();
   void write_normal();
@@ -254,8 +255,8 @@ inline void store_component(float* out, int stride, const PacketRays& rays, vflo
   scatter(out, rays.ray * stride, v, rays.exists);
 }
 
-// B features from `first` on.
-template <int B>
+// B features from `first` on. A feature that is not finite would reach rays with weight 0, too: then hits only.
+template <int B, bool kHitsOnly>
 inline void PacketTracer::sum_channels(int first) {
   const int channels = args_.surfels.feature_count();
   vfloat sums[B];
@@ -264,8 +265,12 @@ inline void PacketTracer::sum_channels(int first) {
     const float* row = args_.surfels.arrays.features + int64_t(channels) * work_.met_ids[k] + first;
     const vfloat w = load(work_.weights.data + int64_t(work_.met_places[k]) * kLanes);
 #pragma GCC unroll 16
-    for (int c = 0; c < B; ++c) sums[c] = fma(w, broadcast(row[c]), sums[c]);
+    for (int c = 0; c < B; ++c)
+      sums[c] = fma(w, kHitsOnly ? where(gt(w, broadcast(0.f)), broadcast(row[c])) : broadcast(row[c]), sums[c]);
   }
+  if constexpr (!kHitsOnly)
+    for (int c = 0; c < B; ++c)
+      if (any(mask_not(finite(sums[c])))) return sum_channels<B, true>(first);
   for (int c = 0; c < B; ++c) store_component(args_.features + first + c, channels, rays_, sums[c]);
 }
 
@@ -284,7 +289,8 @@ inline void PacketTracer::write_colors() {
   for (int k = 0; k < met_; ++k) {
     const vfloat w = load(work_.weights.data + int64_t(work_.met_places[k]) * kLanes);
     surfel_colors(args_.surfels, work_.met_ids[k], rest, basis, raw);
-    for (int c = 0; c < 3; ++c) sums[c] += w * max(raw[c], broadcast(0.f));
+    const vmask met = gt(w, broadcast(0.f));
+    for (int c = 0; c < 3; ++c) sums[c] += where(met, w * max(raw[c], broadcast(0.f)));
   }
   for (int c = 0; c < 3; ++c) store_component(args_.colors + c, 3, rays_, sums[c]);
 }
