@@ -8,7 +8,7 @@ NATIVE := $(wildcard rtgs/native/*.cpp rtgs/native/*.h rtgs/native/*.cmake) CMak
 RUN ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test e2e bench lint format dashboard accept-steps clean
+.PHONY: help setup demo test e2e bench lint format dashboard accept-steps contact-sheet clean
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-14s %s\n", $$1, $$2}'
@@ -56,6 +56,9 @@ dashboard: setup ## browse the runs in MLflow on this machine (loopback)
 
 accept-steps: setup ## accept the changed source of pipeline steps (after bumping a version, or when the output is the same)
 	$(BIN)/python -m tests.pipelines.accept_steps
+
+contact-sheet: setup ## docs/images/scenes.jpg: every path-traced scene with its layers; prints their figures
+	$(BIN)/python -m rtgs.scenes.contact_sheet docs/images/scenes.jpg
 
 clean: ## remove the environment and build products (not the store)
 	rm -rf $(VENV) build

@@ -89,6 +89,8 @@ class PathTracer:
             pixel = dr.opaque(mi.UInt32, first) + dr.arange(mi.UInt32, count * samples) // samples
             place = mi.Point2f(mi.Float(pixel % camera.width), mi.Float(pixel // camera.width)) + sampler.next_2d()
             layers = self._first_surface.layers(_rays(mi, camera, place), sampler)
+            # A grazing sample in millions divides zero by zero; it counts as dark instead of blackening its pixel.
+            layers = [dr.select(dr.isfinite(color), color, 0.0) for color in layers]
             dr.eval(layers)  # one kernel for the nine channels
             for index, color in enumerate(layers):
                 sums = [np.array(dr.block_sum(channel, samples)) for channel in color]
@@ -103,7 +105,7 @@ class PathTracer:
             for _ in range(samples):
                 place = mi.Point2f(column, row) + sampler.next_2d()
                 for index, color in enumerate(self._first_surface.layers(_rays(mi, camera, place), sampler)):
-                    total[index, row, column] += np.array(color)
+                    total[index, row, column] += np.nan_to_num(np.array(color), posinf=0.0)
                 sampler.advance()
         return total
 

@@ -1,0 +1,49 @@
+"""Every shipped path-traced capture is what its description gives: one view again, small, in the scalar variant.
+
+The shipped captures were rendered with light maps (docs/scenes.md), this is a full path trace: apart from Monte-Carlo
+noise, which two independent halves tell, it may differ by what the map smooths away.
+"""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mitsuba", reason="path tracing needs the extra 'synthetic'")
+
+from rtgs.scenes.contact_sheet import synthetic_captures
+from rtgs.scenes.images import area_resize, nearest_resize
+from rtgs.scenes.synthetic.capture import description_digest
+from rtgs.scenes.synthetic.description import named_scene
+from rtgs.scenes.synthetic.record import CaptureRecord
+from rtgs.scenes.synthetic.render import PathTracer
+from rtgs.scenes.synthetic.variants import SCALAR_VARIANT
+from rtgs.scenes.synthetic.viewpoints import cameras
+from rtgs.scenes.truth import LAYERS, read_truth
+
+WIDTH, HEIGHT, SAMPLES = 48, 36, 4
+MAP_ERROR = 0.06  # root mean square in linear light, of what light maps smooth away: contact shadows
+MAP_SHIFT = 0.15  # of a layer's mean: mirrored lamps lack what they reflect
+
+
+@pytest.mark.parametrize("folder", synthetic_captures(), ids=lambda folder: folder.name)
+def test_a_view_rendered_again_is_the_shipped_one(folder):
+    record, description = CaptureRecord.read(folder), named_scene(folder.name)
+    assert record is not None
+    assert record.description_sha256 == description_digest(description), "the scene changed after it was rendered"
+    camera = cameras(description.viewpoints, record.width, record.height, record.seed)[0]
+    truth = read_truth(folder / "truth" / camera.name)
+    tracer = PathTracer(description, record.seed, SCALAR_VARIANT)
+    small = camera.resized(WIDTH, HEIGHT)
+    shapes = tracer.geometry(small).shape
+    shipped_shapes = nearest_resize(truth.objects.numpy(), WIDTH, HEIGHT)
+    assert (shapes == shipped_shapes).mean() > 0.97  # the rest are edges
+    halves = [tracer.layers(small, SAMPLES, stream) for stream in (1, 2)]
+    lamps = [number for number, shape in enumerate(description.shapes) if shape.emission is not None]
+    compared = ~np.isin(shapes, lamps)  # light maps leave out what lamps reflect besides what they send out
+    for layer in (*LAYERS, "image"):
+        first, second = (getattr(half, layer).clip(0, 1)[compared] for half in halves)
+        shipped = sum(getattr(truth, name) for name in (LAYERS if layer == "image" else (layer,)))
+        expected = area_resize(np.ascontiguousarray(shipped.numpy().transpose(1, 2, 0)), WIDTH, HEIGHT)
+        expected = expected.clip(0, 1)[compared]
+        error, noise = (first + second) / 2 - expected, np.mean((first - second) ** 2) / 4
+        assert np.mean(error**2) <= 1.5 * noise + MAP_ERROR**2, layer
+        assert abs(error.mean()) <= MAP_SHIFT * expected.mean() + 3 * np.sqrt(noise / len(error)), layer
