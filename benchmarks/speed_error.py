@@ -9,7 +9,8 @@ Training: PSNR and SSIM of the held-out views against CPU seconds of training, f
 surfels, and the number of steps with the schedule shrunk along. Each run starts from the preset ``quick``; one run per
 point. Peak memory is that of each run where the kernel lets a process reset it (Linux), else of the process so far.
 
-Tracer: time against error of what makes it faster (``benchmarks.trace_levers``), plotted apart.
+Tracer: time against error of what makes it faster (``benchmarks.trace_levers``), plotted apart; and end to end, PSNR
+after equal time (``benchmarks.trace_training``).
 
 Writes ``speed_error.png``, ``speed_error_tracer.png`` and ``speed_error.json`` into ``benchmarks/results`` and prints
 the JSON as its last line.
@@ -37,6 +38,7 @@ from benchmarks.machine import machine
 from benchmarks.speed_error_plot import GRADIENT_BOUND, PICTURE_BOUND, draw
 from benchmarks.trace_levers import defaults, lever_figures
 from benchmarks.trace_levers_plot import draw_levers
+from benchmarks.trace_training import SETTINGS, end_to_end_points
 from benchmarks.training_runs import schedule_overrides, train_run
 from benchmarks.yardstick_scene import HEIGHT, SCALES, WIDTH, made_arrays
 from rtgs.cameras import Camera
@@ -53,7 +55,7 @@ INPUTS = ("means", "tangent_u", "tangent_v", "scales", "opacities", "features")
 PICTURES = ("features", "alpha", "depth", "normal")
 TWIN_ROUNDS = 2  # the dense twins take seconds
 METHOD, PRESET = "rtgs", "quick"
-PARTS = ("kernel", "training", "tracer")
+PARTS = ("kernel", "training", "tracer", "end_to_end")
 
 
 @dataclass(frozen=True)
@@ -218,7 +220,7 @@ def scenes_here() -> list[str]:
 def measure(arguments: argparse.Namespace, kept: dict[str, Any]) -> dict[str, Any]:
     """All figures that were asked for, and those of ``kept`` for parts that were not."""
     figures: dict[str, Any] = {"machine": machine(), "kernel": None, "training": [], "training_runs_per_point": 1}
-    figures |= {"training_threads": arguments.threads, "tracer": None} | kept
+    figures |= {"training_threads": arguments.threads, "tracer": None, "end_to_end": []} | kept
     if "training" in arguments.parts:  # first: memory that the twins leave behind is not training's
         torch.set_num_threads(arguments.threads)
         figures |= {"training_threads": arguments.threads, "training": []}
@@ -235,6 +237,12 @@ def measure(arguments: argparse.Namespace, kept: dict[str, Any]) -> dict[str, An
                 f"{key} {value:.3g}" if isinstance(value, float) else f"{key} {value}" for key, value in values.items()
             )
             print(f"{name:14}", "  ".join(words))
+    if "end_to_end" in arguments.parts:
+        torch.set_num_threads(arguments.threads)
+        words, size = arguments.lever_scene.split(), arguments.long_side
+        chosen = tuple(SETTINGS)[: arguments.lever_settings]
+        found = end_to_end_points(words, arguments.lever_steps, size, chosen)
+        figures["end_to_end"] = [asdict(point) for point in found]
     if "tracer" in arguments.parts:
         torch.set_num_threads(1)
         figures["tracer"] = lever_figures(arguments.lever_surfels, max(2, arguments.rounds // 6))
@@ -252,6 +260,9 @@ def parse() -> argparse.Namespace:
     add("--width", type=int, help="of the kernel scene's picture in pixels (96; quick: 64)")
     add("--rounds", type=int, help="of the native kernels (30; quick: 10)")
     add("--lever-surfels", type=int, choices=(20_000, 100_000), help="of the tracer's levers (100,000; quick: 20,000)")
+    add("--lever-scene", default="scene=demo", help="config words of the scene of end_to_end")
+    add("--lever-steps", type=int, help="of its reference run (1000; quick: 200)")
+    add("--lever-settings", type=int, help="how many of its settings (all; quick: 4)")
     add("--scenes", nargs="+", help="scene configs (demo, and fox where RTGS_SHARED has it; quick: demo)")
     add("--steps", type=int, nargs="+", help="lengths of training at the largest cap")
     add("--caps", type=int, nargs="+", help="caps on surfels at the most steps")
@@ -266,6 +277,8 @@ def parse() -> argparse.Namespace:
         "width": 64 if quick else 96,
         "rounds": 10 if quick else 30,
         "lever_surfels": 20_000 if quick else 100_000,
+        "lever_steps": 200 if quick else 1000,
+        "lever_settings": 4 if quick else len(SETTINGS),
         "scenes": ["demo"] if quick else scenes_here(),
         "steps": [250, 500, 1000] if quick else [500, 1000, 2000],
         "caps": [10_000] if quick else [5_000, 10_000, 20_000, 40_000],

@@ -45,8 +45,16 @@ STRIDES = (1, 2, 3)
 
 
 def defaults() -> dict[str, float]:
-    """Where the defaults of training sit on each lever; levers that have none are absent."""
-    return {"transmittance_cutoff": DEFAULTS.transmittance_cutoff, "alpha_cutoff": DEFAULTS.alpha_cutoff}
+    """Where the defaults of training sit on the levers that training has."""
+    from rtgs.train.settings import ReflectionSettings
+
+    settings = ReflectionSettings()
+    return {
+        "transmittance_cutoff": settings.transmittance_cutoff,
+        "alpha_cutoff": settings.alpha_cutoff,
+        "refit_interval": settings.rebuild_every,
+        "specular_threshold": settings.traced.threshold,
+    }
 
 
 @dataclass(frozen=True)

@@ -107,6 +107,15 @@ def test_speed_error_of_the_tracer(run, tmp_path: Path) -> None:
     assert (tmp_path / "speed_error_tracer.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_speed_error_end_to_end(run, tmp_path: Path) -> None:
+    words = ("--lever-steps", "4", "--lever-settings", "2", "--long-side", "32")
+    figures = run(speed_error, "--quick", "--parts", "end_to_end", *words, "--output", str(tmp_path))
+    points = figures["end_to_end"]
+    assert [point["equal"] for point in points] == ["steps", "steps", "time"]
+    assert points[0]["steps"] == points[1]["steps"] == 4
+    assert all(point["psnr"] > 0 and point["cpu_seconds"] > 0 for point in points)
+
+
 def test_train_step(run) -> None:
     figures = run(train_step, "--rounds", "1")
     parts = ("activate", "raster", "photometric", "normal", "adam", "density")

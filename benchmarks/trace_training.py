@@ -1,0 +1,65 @@
+"""The tracer's levers end to end: PSNR of method ``rtgs`` after equal time, for ``benchmarks.speed_error``.
+
+Each setting is trained twice: for as many steps as the reference (equal steps), and for as many as fit into its CPU
+seconds (equal time, predicted from the first run; the seconds it took are reported). Preset ``quick``, its schedule
+shrunk along; a matte verdict is switched off, because it would end what is to be measured. One run per point.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from benchmarks.training_runs import schedule_overrides, train_run
+
+PRESET = "quick"
+TRACED = "method.reflection.traced"
+SETTINGS: dict[str, tuple[str, ...]] = {  # the first is the reference: every pixel traced, published cuts
+    "all traced": (f"{TRACED}.threshold=0",),
+    "threshold 0.01, 1/4 of the rest": (f"{TRACED}.threshold=0.01", f"{TRACED}.share=0.25"),
+    "threshold 0.03, 1/4 of the rest": (f"{TRACED}.threshold=0.03", f"{TRACED}.share=0.25"),
+    "threshold 0.03, 1/10 of the rest": (f"{TRACED}.threshold=0.03", f"{TRACED}.share=0.1"),
+    "rebuilt every 10 steps": (f"{TRACED}.threshold=0", "method.reflection.rebuild_every=10"),
+    "rebuilt every 1000 steps": (f"{TRACED}.threshold=0", "method.reflection.rebuild_every=1000"),
+    "transmittance cutoff 1e-2": (f"{TRACED}.threshold=0", "method.reflection.transmittance_cutoff=0.01"),
+    "alpha cutoff 1/64": (f"{TRACED}.threshold=0", "method.reflection.alpha_cutoff=0.015625"),
+}
+NOT_MATTE = "method.reflection.matte.probation=0"
+
+
+@dataclass(frozen=True)
+class EndToEndPoint:
+    """One run."""
+
+    setting: str
+    equal: str  # to the reference: "steps" or "time"
+    steps: int
+    cpu_seconds: float
+    psnr: float | None
+    psnr_specular: float | None  # on specular objects, where truth is known
+
+
+def end_to_end_points(
+    scene: Sequence[str], steps: int, long_side: int | None, settings: Sequence[str] = tuple(SETTINGS)
+) -> list[EndToEndPoint]:
+    """Train every setting. ``scene``: config words that name it; ``settings``: of SETTINGS, the reference first."""
+    points: list[EndToEndPoint] = []
+    for name in settings:
+        point = _train(scene, name, "steps", steps, long_side)
+        points.append(point)
+        print(point, flush=True)
+        afforded = round(steps * points[0].cpu_seconds / point.cpu_seconds)
+        if name != settings[0]:
+            points.append(_train(scene, name, "time", max(2, afforded), long_side))
+            print(points[-1], flush=True)
+    return points
+
+
+def _train(scene: Sequence[str], name: str, equal: str, steps: int, long_side: int | None) -> EndToEndPoint:
+    words = [*scene, "method=rtgs", f"preset={PRESET}", *schedule_overrides(steps, PRESET), NOT_MATTE, *SETTINGS[name]]
+    run = train_run(words, long_side)
+    quality = run.quality()
+    psnr, specular = (
+        None if value is None else round(value, 3) for value in (quality["psnr"], quality["psnr_specular"])
+    )
+    return EndToEndPoint(name, equal, steps, round(run.cpu_seconds, 2), psnr, specular)
