@@ -61,15 +61,10 @@ def shared_shrink(opacity: Tensor, copies: Tensor) -> Tensor:
 
 
 class McmcControl(DensityControl):
-    """Relocation, growth and noise behind the interface of :class:`DensityControl`; needs no signal."""
+    """Relocation, growth and noise behind the interface of :class:`DensityControl`, whose cap is the budget."""
 
     needs_signal = False
     resets_opacity = False
-
-    @property
-    def cap(self) -> int:
-        """The budget that N grows to."""
-        return self.settings.max_surfels
 
     @torch.no_grad()
     def densify(

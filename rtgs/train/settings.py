@@ -75,7 +75,7 @@ class LossSettings:
 
 @dataclass(frozen=True)
 class McmcSettings:
-    """Densification as Markov chain Monte Carlo (Kheradmand et al. 2024), with a fixed budget: ``max_surfels``."""
+    """Densification as Markov chain Monte Carlo (Kheradmand et al. 2024), whose fixed budget is the cap."""
 
     growth: float = 0.05  # at most this share more Gaussians a call, until the budget is reached (their section 4.2)
     # Langevin noise on the means: covariance / extent^2 x standard normal x rate of the means x noise x
@@ -104,7 +104,7 @@ DENSITY_STRATEGIES = ("adaptive", "mcmc")
 class DensitySettings:
     """Density control (methods.md 6.1, 12)."""
 
-    strategy: str = "adaptive"  # or "mcmc": the budget max_surfels, no signal, no opacity resets
+    strategy: str = "adaptive"  # or "mcmc": N grows to the cap and stays; no signal, no opacity resets
     gradient_threshold: float = 2e-4  # mean norm of the densification signal (NDC)
     size_border: float = 0.01  # times extent: larger surfels split, smaller ones clone
     split_count: int = 2

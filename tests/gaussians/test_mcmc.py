@@ -20,7 +20,7 @@ from rtgs.render.reference_ellipsoids import rasterize_ellipsoids
 from rtgs.train.adam import SurfelAdam
 from rtgs.train.settings import DensitySettings, McmcSettings, OptimizerSettings
 
-MCMC = DensitySettings(strategy="mcmc", max_surfels=100)
+MCMC = DensitySettings(strategy="mcmc", max_surfels=100, cap_share=1.0)
 
 
 def generator(seed: int = 0) -> torch.Generator:

@@ -17,7 +17,7 @@ from rtgs.train.seeds import generator_for
 from rtgs.train.settings import DensitySettings, MethodSettings
 
 ELLIPSOIDS = small_method("3dgs")
-MCMC = replace(ELLIPSOIDS, density=DensitySettings(strategy="mcmc", max_surfels=330))
+MCMC = replace(ELLIPSOIDS, density=DensitySettings(strategy="mcmc", max_surfels=330, cap_share=1.0))
 
 
 def make(settings: MethodSettings, **schedule: int):
