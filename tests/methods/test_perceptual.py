@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
-
-sys.path[:0] = [str(Path(__file__).parents[1] / name) for name in ("evaluate", "methods")]
 from reflective_cases import new_method, recipe, schedule, tiny
 from test_lpips import TINY, head_tensors, vgg_tensors
 
