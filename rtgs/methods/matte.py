@@ -24,7 +24,7 @@ class MatteEvidence:
     gain: float  # by which share reflection lowers the squared error of these pixels, against C_d alone
 
     def is_matte(self, settings: MatteSettings) -> bool:
-        return self.share < settings.share or self.gain < settings.gain
+        return self.share < settings.share
 
     def __str__(self) -> str:
         share, gain = 100 * self.share, 100 * self.gain

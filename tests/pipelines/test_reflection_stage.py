@@ -1,0 +1,60 @@
+"""Two training stages through the command line; what they share between ablations."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from test_app import QUICK, _in_root, capture, root  # noqa: F401  (fixtures)
+
+from pipelines.cli import main
+from pipelines.graph import build_graph
+from pipelines.training import stage_params
+from rtgs.config import compose
+from rtgs.gaussians.materials import MaterialSurfels
+from rtgs.gaussians.ply import read_ply
+
+SECOND = ("method.reflection.cells=3", "method.reflection.matte.probation=0", "method.loss.perceptual=0")
+
+
+def training(capture: Path, *words: str) -> dict[str, object]:  # noqa: F811
+    config, choices = compose(["scene=capture", f"scene.path={capture}", "preset=smoke", "scene.points=random", *words])
+    return {step.name: step.params for step in build_graph(config, choices).training}
+
+
+def test_ablations_of_the_second_stage_share_the_first(capture: Path):  # noqa: F811
+    plain = training(capture, "method=rtgs")
+    assert list(plain) == ["train_diffuse", "train_reflection"]
+    for words in (
+        ("ablation=split_sum",),
+        ("method.materials.specular=0.3", "method.optimizer.f0_logits=0.5"),
+        ("method.reflection.cells=7", "method.loss.perceptual=0.5"),
+    ):
+        other = training(capture, "method=rtgs", *words)
+        assert other["train_diffuse"] == plain["train_diffuse"], words
+        assert other["train_reflection"] != plain["train_reflection"], words
+    longer = training(capture, "method=rtgs", "method.reflection.start=0.5")
+    assert longer["train_diffuse"] != plain["train_diffuse"]
+
+
+@pytest.mark.parametrize("name", ["rtgs", "envgs"])
+def test_both_stages_run_and_leave_two_sets_and_layers(root: Path, capture: Path, name: str, capsys):  # noqa: F811
+    words = ["run", f"scene={capture}", f"method={name}", *QUICK, *SECOND]
+    assert main(words) == 0
+    capsys.readouterr()
+    store = root / "store" / "train_reflection"
+    made = [manifest.parent for manifest in store.glob("*/*/manifest.json")]
+    found = [folder for folder in made if stage_params(folder).method.name == name]
+    assert len(found) == 1
+    base, reflection = read_ply(found[0] / "base.ply"), read_ply(found[0] / "reflection.ply")
+    assert isinstance(base, MaterialSurfels)
+    assert not isinstance(reflection, MaterialSurfels)
+    assert len(reflection) > 0
+    summary = json.loads((found[0] / "summary.json").read_text())
+    assert summary["steps"] == 12
+    run = root / "runs" / f"tiny_room-{name}-smoke"
+    page = (run / "report.html").read_text()
+    assert "Reflection" in page
+    assert main(words) == 0
+    assert "nothing to do" in capsys.readouterr().err
