@@ -13,6 +13,8 @@ from rtgs.scenes.synthetic.textures import texture
 TRANSPARENT = ("thin_glass", "glass")  # kinds of material the masks show
 SPECULAR = (*TRANSPARENT, "mirror", "glossy")  # kinds that reflect what stands around
 _FLAT_KINDS = ("box", "plane")
+# a glowing picture stands for what lies beyond an opening: light that meets it does not come back
+_DARK = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}}
 
 
 def scene_of(mi: Any, description: SceneDescription, meshes: dict[str, Mesh], seed: int, *, thin_glass: bool) -> Any:
@@ -28,7 +30,7 @@ def scene_of(mi: Any, description: SceneDescription, meshes: dict[str, Mesh], se
 
 def _mesh(mi: Any, shape: Shape, mesh: Mesh, seed: int) -> Any:
     properties = mi.Properties()
-    properties["bsdf"] = mi.load_dict(_bsdf(mi, shape.material, seed))
+    properties["bsdf"] = mi.load_dict(_DARK if shape.glow != "plain" else _bsdf(mi, shape.material, seed))
     if shape.emission is not None:
         properties["emitter"] = mi.load_dict({"type": "area", "radiance": _radiance(mi, shape, seed)})
     smooth = shape.kind not in _FLAT_KINDS

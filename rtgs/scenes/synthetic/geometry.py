@@ -146,12 +146,13 @@ def kernels(shape: Shape, forms: int = 6, lumps: int = 6) -> Mesh:
 
 def _kernel(radius: float, lumps: int, rng: np.random.Generator) -> Shape:
     """Balls around a middle, within 1.3 ``radius``."""
-    parts = [Part(size=(0.5 * radius,) * 3)]
+    parts = [Part(size=(0.5 * radius, 0.5 * radius, 0.5 * radius))]
     for _ in range(lumps):
         offset = rng.normal(0, 1, 3)
         offset *= rng.uniform(0.5, 0.8) * radius / np.linalg.norm(offset)
         place = (float(offset[0]), float(offset[1]), float(offset[2]))
-        parts.append(Part(position=place, size=(rng.uniform(0.35, 0.5) * radius,) * 3, blend=0.15 * radius))
+        reach = rng.uniform(0.35, 0.5) * radius
+        parts.append(Part(position=place, size=(reach, reach, reach), blend=0.15 * radius))
     return Shape("kernel", "sculpt", parts=tuple(parts), cell=0.11 * radius)
 
 
