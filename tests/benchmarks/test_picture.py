@@ -28,7 +28,7 @@ STEPS = {"import_scene": "a" * 64, "render": "b" * 64}
 def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
     """A run folder beside its store, and the names of its test views; renders are darkened photos."""
     root = tmp_path_factory.mktemp("root")
-    scene = load_scene(SceneSettings(name="demo", path="embedded:glass_demo", long_side=32, max_views=24))
+    scene = load_scene(SceneSettings(name="demo", path="embedded:ball_statue", long_side=32, max_views=24))
     folders = {step: root / "store" / step / print_[:2] / print_ for step, print_ in STEPS.items()}
     (folders["render"] / "views").mkdir(parents=True)
     save_scene(scene, folders["import_scene"])

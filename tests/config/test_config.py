@@ -51,8 +51,8 @@ def message(*overrides: str) -> str:
 def test_defaults_are_the_schema_and_the_chosen_files():
     config, choices = compose([])
     assert (choices.method, choices.preset, choices.ablation) == ("rtgs", "quick", "none")
-    assert config.name == "glass_demo-rtgs-quick"
-    assert config.scene.path == "embedded:glass_demo"
+    assert config.name == "ball_statue-rtgs-quick"
+    assert config.scene.path == "embedded:ball_statue"
     assert Path(config.paths.root).is_absolute()
     assert isinstance(config.scene.background, tuple)
 

@@ -158,7 +158,7 @@ def test_the_source_is_seen_once_with_its_reason(tmp_path):
     given = find_source(scene(colmap), SfmSettings())
     assert (given.kind, given.why) == ("poses", "poses are given (colmap)")
     assert find_source(scene(colmap), SfmSettings(use="always")).kind == "photos"
-    assert find_source(SceneSettings(path="embedded:glass_demo"), SfmSettings()).has_poses
+    assert find_source(SceneSettings(path="embedded:ball_statue"), SfmSettings()).has_poses
     write_photos(tmp_path / "plain", walk(2))
     assert find_source(scene(tmp_path / "plain"), SfmSettings()).kind == "photos"
     with pytest.raises(PrepareError, match=r"sfm.use=never forbids"):

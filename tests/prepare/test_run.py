@@ -61,7 +61,7 @@ def test_photos_become_a_table(photos, tmp_path, capsys):
 def test_given_poses_are_kept_and_the_plan_says_so(capsys, tmp_path, monkeypatch):
     monkeypatch.setenv("RTGS_ROOT", str(tmp_path))
     rows = plan(capsys, "scene=demo", "tracking=off")
-    assert " ".join(rows[1]).startswith("sfm skipped embedded:glass_demo brings its poses")
+    assert " ".join(rows[1]).startswith("sfm skipped embedded:ball_statue brings its poses")
 
 
 def test_check_speaks_of_photos_without_poses(photos, capsys):

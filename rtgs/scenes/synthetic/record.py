@@ -63,6 +63,8 @@ class CaptureRecord:
     specular: float
     reflected_in_mask: float | None
     reflected_in_specular: float | None
+    psnr_specular_2dgs: float | None = None  # dB on mirror, gloss and glass of `method=2dgs preset=quick`
+    psnr_rest_2dgs: float | None = None  # dB elsewhere of the same run; both set by `python -m benchmarks.difficulty`
 
     def labelled(self, name: str) -> str:
         """How tables, pages and logs name the scene: nobody may take a stand-in for a paper's data."""

@@ -33,12 +33,12 @@ class CaptureSettings:
 
     width: int = 256
     height: int = 192
-    lightmap: bool = True
-    """Light on matte surfaces is path-traced once for the scene, not for every view: a twentieth of the time, see
-    :mod:`rtgs.scenes.synthetic.lightmap`. Not in Mitsuba's scalar variant, which traces every path to its end."""
-    samples: int = 16
+    lightmap: bool = False
+    """For previews: light on matte surfaces is path-traced once for the scene, not for every view, in a twentieth of the
+    time and with a bias, see :mod:`rtgs.scenes.synthetic.lightmap`. Not in Mitsuba's scalar variant."""
+    samples: int = 32
     """Paths a pixel of training views."""
-    test_samples: int = 32
+    test_samples: int = 96
     """Paths a pixel of test views, rendered as two halves that measure their noise."""
     test_every: int = 8
     """Views whose index is divisible by it are test views, as the importer splits them (methods.md 8.1)."""
