@@ -139,9 +139,13 @@ def main(arguments: list[str] | None = None) -> None:
             continue
         words = ["--one", str(data / name), "--threads", str(options.threads)]
         words += ["--photos", str(options.photos)] if options.photos else []
-        result = subprocess.run([sys.executable, "-m", "benchmarks.sfm", *words], stdout=subprocess.PIPE, check=True)
+        result = subprocess.run([sys.executable, "-m", "benchmarks.sfm", *words], stdout=subprocess.PIPE, check=False)
+        if result.returncode:
+            print(f"{name}: failed, see above", file=sys.stderr)
+            continue
         values = json.loads(result.stdout.splitlines()[-1])
         rows.append(Row(**{**values, "missing": tuple(values["missing"])}))
+        print(table(rows[-1:]).splitlines()[-1], file=sys.stderr, flush=True)
     print(table(rows))
     print(json.dumps({"rows": [asdict(row) for row in rows], "threads": options.threads, **machine()}))
 

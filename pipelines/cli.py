@@ -24,7 +24,7 @@ USAGE = f"""rtgs {__version__}: Gaussian models of scenes with glass and mirrors
   rtgs report [RUN]                       where the report of the latest (or the named) run is
   rtgs show FILE.ply [--scene NAME]       pictures of any Gaussian splat; with a scene, measured on its test views
   rtgs cache ls|gc|verify|push|pull       the artifact store, and the one that machines share
-  rtgs weights                            pretrained files: what is known, what is there; downloads nothing
+  rtgs weights status                     pretrained files: what is known, what is there; downloads nothing
   rtgs dashboard                          MLflow's pages on this machine
 
   rtgs COMMAND --help tells more. RTGS_DEBUG=1 shows tracebacks."""
@@ -174,16 +174,22 @@ def check(words: list[str]) -> int:
 
 def weights(words: list[str]) -> int:
     """``rtgs weights``: pretrained files by name."""
-    argparse.ArgumentParser("rtgs weights", description="Pretrained files; nothing is downloaded.").parse_args(words)
-    from rtgs.evaluate.weights import weight_folders, weights_report
+    parser = argparse.ArgumentParser("rtgs weights", description="Pretrained files; nothing is downloaded.")
+    parser.add_argument("action", nargs="?", choices=("status",), default="status", help="what is known, what is there")
+    parser.parse_args(words)
+    from rtgs.evaluate.weights import sha256_of, weight_folders, weights_report
+    from rtgs.prepare.weights import REGISTRY
 
-    for status in weights_report():
+    for status in weights_report(files=REGISTRY.values()):
         file = status.file
+        digest = file.sha256 or "not registered" + (f", yours is {sha256_of(status.path)}" if status.path else "")
         print(f"{file.name}: {file.used_for}")
-        print(f"  file     {file.filename}, {file.megabytes:g} MB, sha256 {file.sha256}")
+        print(f"  file     {file.filename}, {file.megabytes:g} MB, sha256 {digest}")
         print(f"  state    {f'present at {status.path}' if not status.problem else 'absent or wrong'}")
         print(f"  licence  {file.licence}")
         print(f"  source   {file.source}")
+        if file.export:
+            print(f"  made by  {file.export}")
         if status.path is not None and status.problem:
             print(f"  problem  {status.problem}")
     print("\nfolders searched, the first that has the file wins (RTGS_WEIGHTS names one more):")

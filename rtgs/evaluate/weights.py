@@ -1,6 +1,7 @@
 """Pretrained files: what they are called, where they are looked for, how they are verified. Nothing is downloaded.
 
-``rtgs weights`` prints :func:`weights_report`.
+The mechanism, and the files the metrics need; :mod:`rtgs.prepare.weights` adds those of the preparation and is the
+whole registry, which ``rtgs weights status`` prints.
 """
 
 from __future__ import annotations
@@ -31,11 +32,12 @@ class PretrainedFile:
 
     name: str  # key in the registry
     filename: str  # relative to a weights folder
-    sha256: str  # of the whole file
+    sha256: str  # of the whole file; empty: not known, since people export it themselves
     megabytes: float
     licence: str
     source: str  # a page to read, in words; never fetched by the program
     used_for: str
+    export: str = ""  # how to make it, where it is not published in this form
 
 
 VGG16 = PretrainedFile(
@@ -96,10 +98,11 @@ def find_weights(file: PretrainedFile, folders: Iterable[Path] | None = None) ->
         if (folder / file.filename).is_file():
             return folder / file.filename
     places = ", ".join(_readable(folder) for folder in searched)
+    how = f" Made by: {file.export}." if file.export else ""
     raise MissingWeights(
         f"weights missing: {file.filename} ({file.megabytes:g} MB, {file.used_for}); searched {places}. "
         f"Get it from {file.source} (licence: {file.licence}) and put it into one of these folders, "
-        "or point RTGS_WEIGHTS to yours."
+        f"or point RTGS_WEIGHTS to yours.{how}"
     )
 
 
@@ -115,11 +118,13 @@ def _readable(folder: Path) -> str:
 
 
 def verify_weights(file: PretrainedFile, path: Path) -> None:
-    """Compare the SHA-256 of ``path`` with the registered one.
+    """Compare the SHA-256 of ``path`` with the registered one, where one is registered.
 
     Raises:
         WrongWeights: they differ: another model, or a download cut short.
     """
+    if not file.sha256:
+        return
     digest = sha256_of(path)
     if digest != file.sha256:
         raise WrongWeights(
@@ -135,11 +140,13 @@ def sha256_of(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def weights_report(folders: Iterable[Path] | None = None) -> list[WeightStatus]:
-    """One status per registered file; files that are there are verified."""
+def weights_report(
+    folders: Iterable[Path] | None = None, files: Iterable[PretrainedFile] | None = None
+) -> list[WeightStatus]:
+    """One status per file (default: those of the metrics); files that are there are verified."""
     searched = tuple(weight_folders() if folders is None else folders)
     report = []
-    for file in REGISTRY.values():
+    for file in REGISTRY.values() if files is None else files:
         path = None
         try:
             path = find_weights(file, searched)

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from rtgs.prepare.errors import PrepareError
 from rtgs.prepare.photos import PhotoSet, fitted_mask, side_file
-from rtgs.prepare.settings import PrepareError
 from rtgs.scenes.images import NORMAL_SUFFIXES, read_normals, same_aspect, unit_or_zero
 from rtgs.scenes.undistort import Lens, undistort_image, undistort_nearest
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageOps
 
-from rtgs.prepare.settings import PrepareError
+from rtgs.prepare.errors import PrepareError
 from rtgs.scenes.canonical import content_hash
 from rtgs.scenes.capture import Finding, existing_side_file, list_some
 from rtgs.scenes.colmap import IMAGE_FOLDERS

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 
 from rtgs.prepare import export, quality, sfm
+from rtgs.prepare.errors import PrepareError
 from rtgs.prepare.photos import PhotoSet, lay_out, read_photo_set, write_ignored
 from rtgs.prepare.progress import Say, Ticker
-from rtgs.prepare.settings import PrepareError, SfmSettings
+from rtgs.prepare.settings import SfmSettings
 from rtgs.prepare.world import choose_world
 from rtgs.scenes.settings import SceneSettings
 

@@ -1,23 +1,19 @@
-"""What the preparation of a capture can be told: the schema of the ``sfm`` config group.
+"""What the preparation of a capture can be told: the schema of the ``sfm`` and ``normals`` config groups.
 
 Numbers without a source are COLMAP's defaults (``pycolmap.IncrementalPipelineOptions`` and its siblings print them).
 """
 
 from __future__ import annotations
 
-import difflib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
-from rtgs.errors import RtgsError
+from rtgs.prepare.adapters import ADAPTERS, NormalAdapter
+from rtgs.prepare.errors import PrepareError, check_choice
 
 USE = ("auto", "always", "never")
 MATCHING = ("auto", "exhaustive", "sequential", "retrieval")
 MAPPERS = ("incremental", "global")
 FEATURES = ("sift", "aliked_n16rot", "aliked_n32")
-
-
-class PrepareError(RtgsError):
-    """Photos, a video or a model from which nothing can be prepared: what is wrong, the value, where, what to do."""
 
 
 @dataclass(frozen=True)
@@ -169,14 +165,44 @@ class SfmSettings:
             raise PrepareError(f"setting sfm.video.shift={self.video.shift}: must lie between 0 and 1 (long sides)")
 
 
-def check_choice(key: str, value: str, known: tuple[str, ...]) -> None:
-    """Refuse a word that is not one of ``known``.
+@dataclass(frozen=True)
+class NormalSettings:
+    """Monocular normals for photos that have none.
 
     Raises:
-        PrepareError: names the key, the value, the choices, and the nearest of them.
+        PrepareError: a value outside its documented range.
     """
-    if value in known:
-        return
-    close = difflib.get_close_matches(value, known, n=1)
-    hint = f"; did you mean {close[0]!r}?" if close else ""
-    raise PrepareError(f"setting {key}={value!r} is unknown: choose one of {', '.join(known)}{hint}")
+
+    use: str = "auto"
+    """``auto``: where a loss of the method reads them, none are given, and the network's file is there. ``always``:
+    also without such a loss or in place of given ones, and a missing file is an error. ``never``."""
+    model: str = "stablenormal"
+    """``stablenormal``, ``dsine``, ``omnidata``, ``metric3d`` (:mod:`rtgs.prepare.adapters` declares what their
+    numbers mean), or ``custom``: as ``adapter`` says."""
+    file: str = ""
+    """ONNX file. Empty: the registered name in the folders of weights (``rtgs weights status``)."""
+    sha256: str = ""
+    """Digest the file must have; empty: any."""
+    axes: tuple[str, ...] = ()
+    """Instead of the adapter's axes: what the three channels are in x right, y down, z forward, as [+x,-y,-z]."""
+    adapter: NormalAdapter = field(default_factory=NormalAdapter)
+    """Of a ``custom`` network."""
+    max_side: int = 1024
+    """Long side of the stored maps; the import brings them to the size of the views."""
+    check: bool = True
+    """Stop when the capture's points say that an axis is flipped."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "axes", tuple(self.axes))
+        check_choice("normals.use", self.use, USE)
+        check_choice("normals.model", self.model, (*ADAPTERS, "custom"))
+        if self.model == "custom" and not self.file:
+            raise PrepareError("setting normals.model=custom needs normals.file, the ONNX file")
+        if not self.max_side >= 32:
+            raise PrepareError(f"setting normals.max_side={self.max_side}: must be at least 32")
+
+    @property
+    def declared(self) -> NormalAdapter:
+        """The adapter in force."""
+        adapter = self.adapter if self.model == "custom" else ADAPTERS[self.model]
+        return replace(adapter, axes=self.axes) if self.axes else adapter

@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 
 from rtgs.prepare import pairs
+from rtgs.prepare.errors import PrepareError
 from rtgs.prepare.photos import PhotoSet
 from rtgs.prepare.progress import Say, Ticker
-from rtgs.prepare.settings import PrepareError, SfmSettings
+from rtgs.prepare.settings import SfmSettings
 
 _PHOTOS_PER_CALL = 8  # features are searched in this many photos between two looks at the clock
 _PAIRS_PER_CALL = 400  # the matcher reads descriptors again in each call: fewer calls are faster

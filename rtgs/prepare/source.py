@@ -6,9 +6,10 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
+from rtgs.prepare.errors import PrepareError
 from rtgs.prepare.photos import VIDEO_SUFFIXES, find_photo_folder, photo_files, read_photo_set
 from rtgs.prepare.poses import Request, check_count, ignored_folders
-from rtgs.prepare.settings import PrepareError, SfmSettings
+from rtgs.prepare.settings import SfmSettings
 from rtgs.scenes.canonical import files_digest
 from rtgs.scenes.capture import Finding, list_some
 from rtgs.scenes.check import check_capture

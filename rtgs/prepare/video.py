@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from rtgs.prepare.settings import PrepareError, VideoSettings
+from rtgs.prepare.errors import PrepareError
+from rtgs.prepare.settings import VideoSettings
 
 _LOOK_SIDE = 320  # pixels; long side at which motion and sharpness are measured
 _CORNERS = 200

@@ -174,6 +174,14 @@ def _valid(grid: np.ndarray, lens: Lens) -> np.ndarray:
     return inside & (right[0] * down[1] - right[1] * down[0] > 0)
 
 
+def project(lens: Lens, local: np.ndarray) -> np.ndarray:
+    """Pixels (N, 2) of the distorted image, centres at i + 0.5, of points (N, 3) before the camera (x, y, z > 0)."""
+    if lens.is_pinhole:
+        fx, fy, cx, cy = lens.pinhole().params
+        return local[:, :2] / local[:, 2:] * (fx, fy) + (cx, cy)
+    return np.asarray(_colmap_camera(lens).img_from_cam(local / local[:, 2:])).reshape(-1, 2)
+
+
 def undistort_image(image: np.ndarray, lens: Lens) -> np.ndarray:
     """Resample a float32 photo (H, W, C) to the pinhole of ``lens`` by bilinear interpolation; edge pixels repeat."""
     if lens.is_pinhole:

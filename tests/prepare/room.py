@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
 
@@ -84,3 +85,36 @@ def write_photos(folder: Path, poses: list[Pose], seed: int = 0, name: str = "ph
     for path, pose in zip(paths, poses):
         Image.fromarray(photo(pose, seed)).save(path, quality=95)
     return paths
+
+
+def normal_photo(pose: Pose, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
+    """(H, W, 3) uint8: the camera-frame normals of floor and walls, painted as (n + 1) / 2."""
+    focal = FOCAL * max(width, height) / WIDTH
+    x, y = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
+    rays = np.stack([x / focal, y / focal, np.ones_like(x)], axis=-1) @ pose.rotation
+    center = -pose.rotation.T @ pose.translation
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = -center / rays
+    axis = np.where(depth > 1e-6, depth, np.inf).argmin(axis=-1)
+    return np.round((np.eye(3)[axis] @ pose.rotation.T + 1) / 2 * 255).astype(np.uint8)
+
+
+def write_normal_capture(root: Path, count: int = 4, points: int = 600) -> Path:
+    """A COLMAP text model of photos that show their own normals, with points on floor and walls."""
+    (root / "images").mkdir(parents=True)
+    (root / "sparse/0").mkdir(parents=True)
+    lines = []
+    for index, pose in enumerate(walk(count)):
+        Image.fromarray(normal_photo(pose)).save(root / f"images/photo_{index:02d}.png")
+        x, y, z, w = Rotation.from_matrix(pose.rotation).as_quat()
+        numbers = " ".join(f"{value:.12f}" for value in (w, x, y, z, *pose.translation))
+        lines += [f"{index + 1} {numbers} 1 photo_{index:02d}.png", ""]
+    (root / "sparse/0/images.txt").write_text("\n".join(lines) + "\n")
+    lens = f"1 PINHOLE {WIDTH} {HEIGHT} {FOCAL} {FOCAL} {WIDTH / 2} {HEIGHT / 2}\n"
+    (root / "sparse/0/cameras.txt").write_text(lens)
+    rng = np.random.default_rng(0)
+    spots = rng.random((points, 3)) * 2
+    spots[np.arange(points), np.arange(points) % 3] = 0
+    rows = [f"{i + 1} {p[0]:.6f} {p[1]:.6f} {p[2]:.6f} 200 100 50 0.5" for i, p in enumerate(spots)]
+    (root / "sparse/0/points3D.txt").write_text("\n".join(rows) + "\n")
+    return root

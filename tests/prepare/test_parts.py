@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from rtgs.prepare import pairs
 from rtgs.prepare.compare import compare_poses
+from rtgs.prepare.errors import PrepareError
 from rtgs.prepare.quality import Evidence, advise, azimuth_gap, groups_of
-from rtgs.prepare.settings import MatchingSettings, PrepareError, SfmSettings, VideoSettings, WorldSettings
+from rtgs.prepare.settings import MatchingSettings, SfmSettings, VideoSettings, WorldSettings
 from rtgs.prepare.source import find_source, source_digest
 from rtgs.prepare.world import choose_world, find_up
 from rtgs.scenes.capture import CaptureView

@@ -12,9 +12,10 @@ from PIL import Image
 
 from rtgs.prepare import sfm
 from rtgs.prepare.compare import compare_poses
+from rtgs.prepare.errors import PrepareError
 from rtgs.prepare.poses import Request, find_poses
 from rtgs.prepare.quality import SfmReport
-from rtgs.prepare.settings import FeatureSettings, MappingSettings, MatchingSettings, PrepareError, SfmSettings
+from rtgs.prepare.settings import FeatureSettings, MappingSettings, MatchingSettings, SfmSettings
 from rtgs.scenes.capture import CaptureView
 from rtgs.scenes.importers import read_capture
 from rtgs.scenes.scene import load_scene

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from rtgs.prepare.errors import PrepareError
 from rtgs.prepare.progress import Ticker
-from rtgs.prepare.settings import PrepareError, VideoSettings
+from rtgs.prepare.settings import VideoSettings
 from rtgs.prepare.video import Candidate, look_at_frames, select_frames, shift_between, write_frames
 from tests.prepare.room import photo, walk
 

@@ -1,0 +1,72 @@
+"""What the numbers of monocular normal networks mean, declared family by family."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rtgs.prepare.errors import PrepareError, check_choice
+
+_AXES = ("+x", "-x", "+y", "-y", "+z", "-z")
+IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+
+
+@dataclass(frozen=True)
+class NormalAdapter:
+    """How a normal network wants its picture and what its numbers mean.
+
+    Raises:
+        PrepareError: axes that are not three different ones, an unknown way to fit.
+    """
+
+    input: str = ""
+    """Name of the picture's input; empty: the first."""
+    intrinsics: str = ""
+    """Name of an input of shape (1, 3, 3) for the calibration matrix, in pixels of the input; empty: none."""
+    output: str = ""
+    """Name of the output; empty: the first. Channels beyond the third (confidence) are left out."""
+    axes: tuple[str, ...] = ("+x", "+y", "+z")
+    """What the output's three channels are, in x right, y down, z forward of the camera."""
+    unit_range: bool = False
+    """The output holds (n + 1) / 2 in 0..1 instead of n."""
+    mean: tuple[float, ...] = (0.0, 0.0, 0.0)
+    std: tuple[float, ...] = (1.0, 1.0, 1.0)
+    """The network sees (picture - mean) / std, the picture in 0..1."""
+    channels_last: bool = False
+    """(1, H, W, 3) instead of (1, 3, H, W), input and output."""
+    fit: str = "multiple"
+    """``multiple``: shrink to ``size`` on the long side and round both sides to a multiple of ``multiple``;
+    ``stretch``: to size x size, aspect lost; ``pad``: shrink into (height, width) = ``box`` and pad with the mean."""
+    size: int = 768
+    multiple: int = 32
+    box: tuple[int, ...] = (616, 1064)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "axes", tuple(self.axes))
+        check_choice("normals.adapter.fit", self.fit, ("multiple", "stretch", "pad"))
+        if len(self.axes) != 3 or {axis[-1:] for axis in self.axes} != set("xyz") or set(self.axes) - set(_AXES):
+            raise PrepareError(
+                f"setting normals.adapter.axes={list(self.axes)}: give three of {', '.join(_AXES)}, one for each axis"
+            )
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """(3, 3) with canonical = matrix @ channels."""
+        result = np.zeros((3, 3), dtype=np.float32)
+        for channel, axis in enumerate(self.axes):
+            result["xyz".index(axis[1]), channel] = -1.0 if axis[0] == "-" else 1.0
+        return result
+
+
+ADAPTERS: dict[str, NormalAdapter] = {
+    # x left, y up, z at the camera (Stable-X/StableNormal issue 18).
+    "stablenormal": NormalAdapter(axes=("-x", "-y", "-z"), mean=(0.5,) * 3, std=(0.5,) * 3, multiple=64),
+    # x right, y down, z forward, but a wall that faces the camera is (0, 0, 1): all three turned (DSINE issue 8).
+    "dsine": NormalAdapter(axes=("-x", "-y", "-z"), mean=IMAGENET_MEAN, std=IMAGENET_STD, intrinsics="intrins"),
+    # (n + 1) / 2 in the camera's x right, y down, z forward (as MonoSDF turns them by the camera's rotation).
+    "omnidata": NormalAdapter(unit_range=True, fit="stretch", size=384),
+    # ImageNet's mean and deviation, 616 x 1064 padded (hubconf.py); four channels, the fourth is confidence.
+    "metric3d": NormalAdapter(output="predicted_normal", mean=IMAGENET_MEAN, std=IMAGENET_STD, fit="pad"),
+}
+"""By name of the registry. A network of another family: set every field of ``normals.adapter``."""
