@@ -6,12 +6,28 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 NATIVE := $(wildcard rtgs/native/*.cpp rtgs/native/*.h rtgs/native/*.cmake) CMakeLists.txt pyproject.toml
 RUN ?=
+# of the tables: PRESET smoke quick standard paper; SEEDS how many; DATA stand_in ref_real nu_nerf (with DATA_ROOT); WORKERS
+PRESET ?= quick
+SEEDS ?= 1
+DATA ?= stand_in
+WORKERS ?= 2
+DATA_ROOT ?= data
+export DATA_ROOT
+comma := ,
+empty :=
+space := $(empty) $(empty)
+SEED_LIST = seed=$(subst $(space),$(comma),$(shell seq 0 $$(($(SEEDS) - 1))))
+SCENES_ref_real := scene=ref_real/sedan,ref_real/gardenspheres,ref_real/toycar table.data=paper
+SCENES_nu_nerf := scene=nu_nerf/ballstatue,nu_nerf/popcorncup,nu_nerf/real_bottle,nu_nerf/tall_bottle table.data=paper
+OWN_SIZE = $(if $(filter-out paper,$(PRESET)),$(if $(filter ref_real,$(DATA)),scene.resize_ratio=null))
+TABLE = $(BIN)/rtgs run preset=$(PRESET) $(SEED_LIST) hydra.launcher.workers=$(WORKERS) $(SCENES_$(DATA)) $(OWN_SIZE)
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test e2e bench lint format dashboard accept-steps contact-sheet clean
+.PHONY: reproduce-table1 reproduce-table2 reproduce-fig-split-sum
 
 help: ## list the targets
-	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-14s %s\n", $$1, $$2}'
+	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-24s %s\n", $$1, $$2}'
 
 setup: $(READY) ## make .venv with everything, native core built
 
@@ -28,6 +44,15 @@ $(READY): $(NATIVE)
 
 demo: setup ## train the embedded glass scene, end with a page of pictures and numbers (under 5 minutes)
 	$(BIN)/rtgs run scene=demo method=rtgs preset=quick $(RUN)
+
+reproduce-table1: setup ## mirrors: every method on every scene, ends with tables/table1-PRESET (PRESET= SEEDS= DATA= WORKERS=)
+	$(TABLE) experiment=table1 $(RUN)
+
+reproduce-table2: setup ## thin glass: the same for Table 2
+	$(TABLE) experiment=table2 $(RUN)
+
+reproduce-fig-split-sum: setup ## microfacet weight against split-sum shading
+	$(TABLE) experiment=fig_split_sum $(RUN)
 
 test: setup ## the tests
 	$(BIN)/python -m pytest -n 2 --dist loadfile
