@@ -19,8 +19,7 @@ space := $(empty) $(empty)
 SEED_LIST = seed=$(subst $(space),$(comma),$(shell seq 0 $$(($(SEEDS) - 1))))
 SCENES_ref_real := scene=ref_real/sedan,ref_real/gardenspheres,ref_real/toycar table.data=paper
 SCENES_nu_nerf := scene=nu_nerf/ballstatue,nu_nerf/popcorncup,nu_nerf/real_bottle,nu_nerf/tall_bottle table.data=paper
-OWN_SIZE = $(if $(filter-out paper,$(PRESET)),$(if $(filter ref_real,$(DATA)),scene.resize_ratio=null))
-TABLE = $(BIN)/rtgs run preset=$(PRESET) $(SEED_LIST) hydra.launcher.workers=$(WORKERS) $(SCENES_$(DATA)) $(OWN_SIZE)
+TABLE = $(BIN)/rtgs run preset=$(PRESET) $(SEED_LIST) hydra.launcher.workers=$(WORKERS) $(SCENES_$(DATA))
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test e2e bench lint format dashboard accept-steps contact-sheet clean

@@ -121,10 +121,12 @@ def unit_or_zero(vectors: np.ndarray) -> np.ndarray:
 
 
 def target_size(width: int, height: int, settings: SceneSettings) -> tuple[int, int]:
-    """Size a view is shrunk to: ``long_side`` (rounded) or ``resize_ratio`` (truncated); never larger than it was."""
-    if settings.resize_ratio is not None:
-        return max(1, int(width * settings.resize_ratio)), max(1, int(height * settings.resize_ratio))
-    longest = max(width, height)
+    """Size a view is shrunk to: ``long_side`` (rounded) or ``resize_ratio`` (truncated), whichever is smaller; never
+    larger than it was.
+    """
+    longest, ratio = max(width, height), settings.resize_ratio
+    if ratio is not None and (settings.long_side is None or longest * ratio <= settings.long_side):
+        return max(1, int(width * ratio)), max(1, int(height * ratio))
     if settings.long_side is None or settings.long_side >= longest:
         return width, height
     scale = settings.long_side / longest

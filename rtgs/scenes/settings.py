@@ -32,8 +32,8 @@ class SceneSettings:
     long_side: int | None = None
     """Long side of the views in pixels, reached by area averaging; never enlarged. None: the photo's own size."""
     resize_ratio: float | None = None
-    """Instead of ``long_side``: a factor in (0, 1] on width and height, truncated by int() as EnvGS does
-    (methods.md 8.1: 0.25 for Ref-Real)."""
+    """A factor in (0, 1] on width and height, truncated by int() as EnvGS does (methods.md 8.1: 0.25 for Ref-Real);
+    with a ``long_side`` as well, as the presets set it, the smaller size of the two."""
     split_every: int = 8
     """Views whose index in name order is divisible by it are test views (methods.md 8.1). 0: no test views."""
     split_file: str | None = None
@@ -84,8 +84,6 @@ class SceneSettings:
         _check_choice("normals_frame", self.normals_frame, NORMAL_FRAMES)
         if len(self.background) != 3 or not all(0 <= c <= 1 for c in self.background):
             raise CaptureError(f"scene setting background={self.background}: give three numbers between 0 and 1")
-        if self.long_side is not None and self.resize_ratio is not None:
-            raise CaptureError("scene settings long_side and resize_ratio are both given: keep one of them")
         if self.resize_ratio is not None and not 0 < self.resize_ratio <= 1:
             raise CaptureError(f"scene setting resize_ratio={self.resize_ratio}: must lie in (0, 1]")
         for field_name, least in (("long_side", 1), ("max_views", 1), ("max_point_error", 0), ("random_box", 0)):

@@ -195,7 +195,6 @@ def test_duplicate_names(tmp_path):
         ({"split_every": -1}, "split_every=-1: must be at least 0"),
         ({"far_factor": float("nan")}, "far_factor=nan"),
         ({"resize_ratio": 2.0}, r"resize_ratio=2.0: must lie in \(0, 1\]"),
-        ({"resize_ratio": 0.5, "long_side": 100}, "both given"),
         ({"background": (0.0, 2.0, 0.0)}, r"background=\(0.0, 2.0, 0.0\): give three numbers between 0 and 1"),
     ],
 )

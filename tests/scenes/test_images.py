@@ -136,6 +136,8 @@ def test_target_sizes():
     assert size(100, 50, long_side=400) == (100, 50)
     assert size(1000, 1, long_side=10) == (10, 1)
     assert size(4947, 3287, resize_ratio=0.25) == (1236, 821)  # EnvGS truncates
+    assert size(4947, 3287, resize_ratio=0.25, long_side=2000) == (1236, 821)
+    assert size(4947, 3287, resize_ratio=0.25, long_side=495) == (495, 329)
     assert size(4947, 3287) == (4947, 3287)
 
 
