@@ -18,6 +18,7 @@ from rtgs.config.explain import explain
 from rtgs.config.locate import choices_of, conf_dir
 from rtgs.config.schema import open_schema
 from rtgs.errors import RtgsError
+from rtgs.evaluate.tables import PAPER_SCORES
 from rtgs.pipeline.fingerprint import fingerprint
 from rtgs.train.settings import ScheduleSettings
 
@@ -209,3 +210,32 @@ def test_an_ablation_flips_one_to_three_keys_and_says_why(ablation):
         return sum(map(leaves, value.values())) if isinstance(value, dict) else 1
 
     assert 1 <= leaves(content) <= 3
+
+
+EXPERIMENTS = choices_of("experiment")
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_an_experiment_names_only_what_there_is(name):
+    values = yaml.safe_load((conf_dir() / "experiment" / f"{name}.yaml").read_text())
+    params = values["hydra"]["sweeper"]["params"]
+    assert params
+    for group, chosen in params.items():
+        assert set(str(chosen).split(",")) <= set(choices_of(group)), group
+
+
+@pytest.mark.parametrize("name", [name for name in EXPERIMENTS if name.startswith(("table", "fig"))])
+def test_tables_say_on_whose_data_they_are(name):
+    config, choices = compose([f"experiment={name}"])
+    assert choices.experiment == name
+    assert config.table.name == name
+    assert config.table.data == "stand_in"
+    assert config.tracking.experiment == f"rtgs/{name}"
+    papers = {scene for _, scene in PAPER_SCORES}
+    assert set(config.table.paper_scenes.values()) <= papers
+
+
+def test_the_papers_datasets_have_its_scene_names():
+    papers = {scene for _, scene in PAPER_SCORES}
+    mine = {compose([f"scene={name}"])[0].scene.name for name in SCENES if "/" in name}
+    assert mine == papers
