@@ -31,8 +31,8 @@ ROUGHNESS = (0.001, 0.005, 0.02, 0.1, 0.5)
 def gain(degrees: np.ndarray, roughness: float, f0: float, optics: OpticsSettings) -> np.ndarray:
     """w_r at angles of incidence (P,) in degrees."""
     cosine = torch.from_numpy(np.cos(np.radians(degrees)))
-    filled = (torch.full_like(cosine, value) for value in (roughness, f0))
-    return specular_weights(cosine, *filled, optics).reflection.numpy()
+    alpha, reflectance = torch.full_like(cosine, roughness), torch.full_like(cosine, f0)
+    return specular_weights(cosine, alpha, reflectance, optics).reflection.numpy()
 
 
 def largest(optics: OpticsSettings, f0: float) -> float:
