@@ -147,7 +147,7 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
                 rows.append(row(scene, method, found))
                 figures.append({"scene": scene, "method": method, "runs": [vars(one) for one in found]})
                 print("  ".join(rows[-1]), flush=True)
-                write(arguments, rows, failures)
+            write(arguments, rows, failures)
     print(f"\n{table(rows)}", flush=True)
     return {"machine": machine(), "preset": arguments.preset, "figures": figures, "failures": failures}
 

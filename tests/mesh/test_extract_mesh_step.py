@@ -30,6 +30,8 @@ PARAMS = step.ExtractMeshParams(TsdfSettings(depth_trunc=6.0, voxel=6.0 / 96), o
 class SphereMethod:
     """Renders a half-transparent unit sphere: the buffers hold sums of w z, as the rasteriser's do."""
 
+    maps = ("depth", "median_depth")
+
     def render(self, camera: Camera, step: int, options: RenderOptions | None = None) -> RenderedView:
         assert options is not None
         assert options.depth

@@ -28,8 +28,8 @@ def test_box_from_anywhere_is_exact(angle: float, height: float) -> None:
     thick = (far - near > 1e-3) | torch.isinf(near)  # through an edge the box is thinner than the merge distance
     thick &= ~torch.isnan(near)
     assert thick.float().mean() > 0.98
-    agree(pair.near[thick], near[thick], 2e-6)
-    agree(pair.far[thick], far[thick], 2e-6)
+    agree(pair.near[thick], near[thick], 1e-5)  # float32 distances of about 3, at grazing angles too
+    agree(pair.far[thick], far[thick], 1e-5)
     inside = pair.hit & thick
     assert not pair.near_back_facing[inside].any()
     assert pair.far_back_facing[inside].all()

@@ -107,7 +107,8 @@ def test_a_model_in_nerfstudios_frame_is_seen_alike(tmp_path, splat, demo):
 def test_what_it_refuses(splat, capsys, words, message):
     path, _ = splat
     assert main(["show", *(word.format(file=path) for word in words)]) == 1
-    assert any(part in capsys.readouterr().err for part in message.split("|"))
+    errors = capsys.readouterr().err
+    assert any(part in errors for part in message.split("|"))
 
 
 def test_the_camera_keeps_its_pixels_when_it_is_moved():

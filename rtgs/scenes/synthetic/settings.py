@@ -34,8 +34,8 @@ class CaptureSettings:
     width: int = 256
     height: int = 192
     lightmap: bool = False
-    """For previews: light on matte surfaces is path-traced once for the scene, not for every view, in a twentieth of the
-    time and with a bias, see :mod:`rtgs.scenes.synthetic.lightmap`. Not in Mitsuba's scalar variant."""
+    """For previews: light on matte surfaces is path-traced once for the scene, not for every view, in a twentieth of
+    the time and with a bias, see :mod:`rtgs.scenes.synthetic.lightmap`. Not in Mitsuba's scalar variant."""
     samples: int = 32
     """Paths a pixel of training views."""
     test_samples: int = 96
