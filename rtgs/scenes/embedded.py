@@ -26,5 +26,11 @@ def embedded_capture(name: str) -> Path:
     """
     names = embedded_names()
     if name not in names:
-        raise CaptureError(f"no embedded capture {name!r}: rtgs ships {', '.join(names) or 'none'}")
+        text = f"no embedded capture {name!r}: rtgs ships {', '.join(names) or 'none'}"
+        if (Path(__file__).parent / "synthetic" / "scenes" / f"{name}.toml").is_file():
+            text += (
+                f". It is described: `rtgs run synthesize scene={name} truth=test output=captures` path-traces it "
+                f"(about ten minutes on two cores), then scene=captures/{name}"
+            )
+        raise CaptureError(text)
     return embedded_folder() / name

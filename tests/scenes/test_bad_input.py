@@ -205,3 +205,8 @@ def test_settings_out_of_range(keys, message):
 
 def test_unknown_embedded_capture():
     refused("embedded:atlantis", "no embedded capture 'atlantis': rtgs ships")
+
+
+def test_a_described_scene_that_is_not_shipped_says_how_to_make_it(monkeypatch):
+    monkeypatch.setattr("rtgs.scenes.embedded.embedded_names", lambda: ("other",))
+    refused("embedded:tall_bottle", "rtgs run synthesize scene=tall_bottle")
