@@ -24,7 +24,7 @@ from .twin_runs import Pools
 PIXEL_TOLERANCE, PIXEL_SHARE = 1e-5, 1e-3
 GRADIENT_TOLERANCE = 1e-4
 SLACK = 4.0  # of degenerate scenes, over the twin in float32
-# Known shortfall, of the largest gradient alone: 1.8e-4 measured (what a nearly opaque pixel has left is a difference).
+# Known shortfall, of the largest gradient alone: 1.8e-4 measured; the cause is not known (cancellation is a guess).
 ILL_CONDITIONED_TOLERANCE = {"huge": 5e-4}
 VARIANTS = {
     "plain": PLAIN,
