@@ -142,10 +142,9 @@ def _ranks(values: Mapping[tuple[str, str], Mapping[str, Value | None]]) -> dict
             found = {key: round(v.mean, metric.digits) for key in mine if (v := values[key][metric.key]) is not None}
             if metric.higher_is_better is None or len(found) < 2:
                 continue
-            order = sorted(set(found.values()), reverse=metric.higher_is_better)
             for key, value in found.items():
                 better = sum(other > value if metric.higher_is_better else other < value for other in found.values())
-                if better < 3 and value in order:
+                if better < 3:
                     ranks[key][metric.key] = better + 1
     return ranks
 

@@ -117,7 +117,7 @@ class DaskExecutor:
             )
         with _watched(plan, len(done)) as tick:
             for future in as_completed(futures.values()):
-                outcome = _outcome(future, plan)
+                outcome = _outcome(future)
                 done[outcome.fingerprint] = outcome
                 tick(outcome)
         return SweepOutcomes({planned.step.fingerprint: done[planned.step.fingerprint] for planned in plan})
@@ -136,7 +136,7 @@ def run_step(step: Step, job: WorkerJob, before: list[StepOutcome]) -> StepOutco
     return executor.outcome(step, f"[{os.uname().nodename} {os.getpid()}]", before)
 
 
-def _outcome(future: Any, plan: Plan) -> StepOutcome:
+def _outcome(future: Any) -> StepOutcome:
     """What a task returned; a task lost with its workers is a failed step."""
     try:
         return future.result()
