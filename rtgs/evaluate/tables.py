@@ -1,4 +1,4 @@
-"""Tables over several runs: ours side by side, and beside the paper's figures where the scene is one of the paper's."""
+"""Runs side by side, and the figures of the paper's tables (:mod:`rtgs.evaluate.publish` sets both side by side)."""
 
 from __future__ import annotations
 
@@ -63,12 +63,6 @@ class SummaryRow:
     train_seconds: float | None
     peak_memory_mb: float | None
     surfels: int | None
-    paper: PaperScore | None
-
-    @property
-    def psnr_difference(self) -> float | None:
-        """Ours minus the paper's; comparable only at the paper's resolution (1/4 of the original images)."""
-        return None if self.paper is None or self.psnr is None else self.psnr - self.paper.psnr
 
 
 def summarize(tables: Sequence[EvaluationTable]) -> list[SummaryRow]:
@@ -89,42 +83,6 @@ def summarize(tables: Sequence[EvaluationTable]) -> list[SummaryRow]:
                 train_seconds=facts.train_seconds,
                 peak_memory_mb=facts.peak_memory_mb,
                 surfels=facts.surfels,
-                paper=PAPER_SCORES.get((facts.method, facts.scene)),
             )
         )
     return rows
-
-
-def markdown_table(rows: Sequence[SummaryRow]) -> str:
-    """The rows as a Markdown table; the paper's columns appear when a row has them."""
-    header = [
-        "scene",
-        "method",
-        "preset",
-        "size",
-        "views",
-        "PSNR",
-        "SSIM",
-        "LPIPS [0,1]",
-        "train s",
-        "peak MB",
-        "surfels",
-    ]
-    with_paper = any(row.paper is not None for row in rows)
-    if with_paper:
-        header += ["paper PSNR / SSIM / LPIPS", "PSNR - paper"]
-    lines = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
-    for row in rows:
-        cells = [row.scene, row.method, row.preset, row.resolution, str(row.views)]
-        cells += [_number(row.psnr, 2), _number(row.ssim, 4), _number(row.lpips_01, 4)]
-        cells += [_number(row.train_seconds, 1), _number(row.peak_memory_mb, 0), _number(row.surfels, 0)]
-        if with_paper:
-            paper = row.paper
-            cells.append(f"{paper.psnr:.3f} / {paper.ssim:.3f} / {paper.lpips:.3f}" if paper else "")
-            cells.append(f"{row.psnr_difference:+.2f}" if row.psnr_difference is not None else "")
-        lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
-    return "\n".join(lines) + "\n"
-
-
-def _number(value: float | None, digits: int) -> str:
-    return NOT_AVAILABLE if value is None else f"{value:.{digits}f}"
