@@ -134,6 +134,11 @@ class MeshGuide:
             start[active], last[active] = distance + steps[active], triangle
         return self._collect(layers, unit, lengths)
 
+    def meets(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """(R,) bool: the ray crosses the mesh at least once."""
+        answer = self._scene.run(origins.astype(np.float32), directions.astype(np.float32), output=True)
+        return answer["primID"] >= 0
+
     def _first_hits(
         self,
         origins: np.ndarray,

@@ -92,3 +92,29 @@ def box_depths(camera: Camera, low, high) -> tuple[torch.Tensor, torch.Tensor]:
     far = torch.maximum(*bounds).amin(-1)
     miss = torch.full_like(near, torch.inf)
     return torch.where(near < far, near, miss), torch.where(near < far, far, miss)
+
+
+def cylinder(radius: float, half: float, sides: int = 96) -> TriangleMesh:
+    """A closed cylinder about z from -half to half, outward orientation."""
+    angle = np.linspace(0, 2 * np.pi, sides, endpoint=False)
+    ring = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+    levels = [np.column_stack([ring, np.full(sides, z)]) for z in (-half, half)]
+    vertices = np.concatenate([*levels, [[0, 0, -half], [0, 0, half]]])
+    faces = []
+    for k in range(sides):
+        a, b = k, (k + 1) % sides
+        faces += [(a, b, b + sides), (a, b + sides, a + sides)]
+        faces += [(2 * sides, b, a), (2 * sides + 1, a + sides, b + sides)]
+    return TriangleMesh(vertices.astype(np.float32), np.array(faces, np.int32))
+
+
+def pane(width: float, height: float, cells: int = 4) -> TriangleMesh:
+    """A rectangle in the plane y = 0 about the origin, facing -y."""
+    x, z = np.meshgrid(np.linspace(-width / 2, width / 2, cells + 1), np.linspace(-height / 2, height / 2, cells + 1))
+    vertices = np.stack([x, np.zeros_like(x), z], axis=-1).reshape(-1, 3)
+    faces = []
+    for row in range(cells):
+        for column in range(cells):
+            a = row * (cells + 1) + column
+            faces += [(a, a + 1, a + cells + 2), (a, a + cells + 2, a + cells + 1)]
+    return TriangleMesh(vertices.astype(np.float32), np.array(faces, np.int32))
