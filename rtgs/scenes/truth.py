@@ -4,7 +4,7 @@
 
 | file | content | precision |
 |---|---|---|
-| ``depth.png``, ``second_depth.png`` | 16-bit grey x ``scale`` (text chunk, metres a step): z-depth, 0 = nothing | half a step: 1/131070 of the view's largest depth |
+| ``depth.png``, ``second_depth.png`` | 16-bit grey x ``scale`` (text chunk, metres a step): z-depth, 0 = nothing | half a level of 8,191: 1/16382 of the view's largest depth |
 | ``normal.png`` | 8-bit RGB, 2 rgb / 255 - 1, camera frame (x right, y down, z forward); black = nothing | 0.4 degrees at most |
 | ``objects.png`` | 8-bit grey: shape id + 1, 0 = nothing | exact |
 | ``specular.png`` | 1 bit: mirror, glossy or glass | exact |
@@ -27,6 +27,8 @@ from rtgs.scenes.settings import CaptureError
 TRUTH_FOLDER = "truth"
 LAYERS = ("diffuse", "reflected", "transmitted")
 _DEPTHS = ("depth", "second_depth")
+_DEPTH_LEVELS = 8191  # finer ones would be half of a shipped capture's truth, and say nothing that 13 bits do not
+_LEVEL_STEP = 8  # 8,191 levels over 16 bits, so that a viewer shows them
 _LARGEST_SCALE = 16.0  # of a layer; brighter light is clipped
 _CLIPPED_SHARE = 1e-3  # of a layer's pixels that may be, so that a few sparks do not coarsen the rest
 
@@ -97,8 +99,9 @@ def write_truth(folder: Path, truth: ViewTruth) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for name in _DEPTHS:
         depth = getattr(truth, name).numpy()
-        scale = float(depth.max()) / 65535 or 1.0
-        _save(folder / f"{name}.png", np.rint(depth / scale).astype(np.uint16), scale)
+        scale = float(depth.max()) / (_DEPTH_LEVELS * _LEVEL_STEP) or 1.0
+        levels = np.maximum(np.rint(depth / (scale * _LEVEL_STEP)), depth > 0).astype(np.uint16)
+        _save(folder / f"{name}.png", levels * np.uint16(_LEVEL_STEP), scale)
     normal = truth.normal.numpy().transpose(1, 2, 0)
     encoded = np.rint((normal + 1) * 127.5) * (np.abs(normal).max(-1, keepdims=True) > 0)
     _save(folder / "normal.png", encoded.astype(np.uint8))

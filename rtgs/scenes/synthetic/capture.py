@@ -31,6 +31,7 @@ from rtgs.scenes.synthetic.noise import noise_of_mean
 from rtgs.scenes.synthetic.record import CaptureRecord, ViewRecord, noise_psnrs, reflected_share, weighted_share
 from rtgs.scenes.synthetic.render import Geometry, PathTracer
 from rtgs.scenes.synthetic.settings import CaptureSettings
+from rtgs.scenes.synthetic.shrink import shrink_pictures
 from rtgs.scenes.synthetic.viewpoints import cameras as make_cameras
 from rtgs.scenes.truth import TRUTH_FOLDER, ViewTruth, srgb_from_linear, write_truth
 
@@ -191,6 +192,7 @@ def _assemble(
     points, colors = feature_points(tracer, pictures, settings.features, settings.seed)
     named = [(camera, record.image) for camera, record in zip(views, records)]
     write_colmap_text(folder / "sparse" / "0", named, points, colors)
+    shrink_pictures(folder)
     record = _capture_record(tracer, records, settings, len(points))
     record.write(folder)
     return record
