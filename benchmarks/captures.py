@@ -1,7 +1,7 @@
 """Method x scene x seed through the whole pipeline at one preset: PSNR, SSIM, time, memory, number, +- over seeds.
 
-Every run is a process of its own (`rtgs run`), so that memory is that of the run. What the store holds is not run
-again: stopped at any time, the same command goes on.
+Every run is a process of its own (`rtgs run`), so that memory is that of the run. Times are CPU times: a busy machine
+does not change them. What the store holds is not run again: stopped at any time, the same command goes on.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ COLUMNS = (
     "views",
     "PSNR",
     "SSIM",
-    "train s",
+    "train CPU s",
     "ms / step",
     "peak MB",
     "Gaussians",
@@ -62,7 +62,7 @@ class Measured:
 
     psnr: float
     ssim: float
-    seconds: float  # of training
+    seconds: float  # CPU time of training, all threads
     ms_per_step: float
     peak_mb: float
     gaussians: int
@@ -92,8 +92,8 @@ def read(path: Path) -> Measured | str:
     return Measured(
         mean["psnr"],
         mean["ssim"],
-        facts["train_seconds"],
-        1000 * facts["train_seconds"] / facts["steps"],
+        facts["train_cpu_seconds"],
+        1000 * facts["train_cpu_seconds"] / facts["steps"],
         facts["peak_memory_mb"],
         facts["surfels"],
         record["resolution"],

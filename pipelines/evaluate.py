@@ -45,6 +45,7 @@ def evaluate(params: EvaluateParams, context: StepContext) -> None:
         preset=params.preset,
         **{key: summary[key] for key in ("steps", "surfels", "peak_memory_mb")},  # pyright: ignore[reportArgumentType]
         train_seconds=summary["seconds"],  # pyright: ignore[reportArgumentType]
+        train_cpu_seconds=summary["cpu_seconds"],  # pyright: ignore[reportArgumentType]
     )
     renders = [read_timed(context.inputs["render"], view.name) for view in scene.test]
     settings = EvaluationSettings(params.evaluation.lpips, params.evaluation.masked, params.evaluation.eight_bit)
@@ -60,7 +61,7 @@ def evaluate(params: EvaluateParams, context: StepContext) -> None:
 
 STEP = StepKind(
     "evaluate",
-    2,
+    3,
     evaluate,
     helpers=(
         "rtgs.evaluate.evaluate",

@@ -13,7 +13,7 @@ def train_diffuse(params: StageParams, context: StepContext) -> None:
 
 STEP = StepKind(
     "train_diffuse",
-    4,
+    5,
     train_diffuse,
     helpers=(
         "pipelines.training",

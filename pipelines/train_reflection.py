@@ -14,7 +14,7 @@ def train_reflection(params: StageParams, context: StepContext) -> None:
 
 STEP = StepKind(
     "train_reflection",
-    1,
+    2,
     train_reflection,
     helpers=(
         *train_diffuse.STEP.helpers,

@@ -79,7 +79,8 @@ class RunFacts:
     preset: str = ""
     steps: int | None = None
     surfels: int | None = None
-    train_seconds: float | None = None
+    train_seconds: float | None = None  # by the wall
+    train_cpu_seconds: float | None = None  # all threads
     peak_memory_mb: float | None = None
 
 
@@ -280,7 +281,7 @@ def write_csv(path: Path, table: EvaluationTable) -> None:
     """One line per view, then mean and std; an absent figure is an empty field."""
     facts = asdict(table.facts)
     header = ["scene", "method", "preset", "view", "resolution", "mask_share", *METRICS]
-    header += ["steps", "surfels", "train_seconds", "peak_memory_mb"]
+    header += ["steps", "surfels", "train_seconds", "train_cpu_seconds", "peak_memory_mb"]
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.DictWriter(stream, header, restval="")

@@ -44,6 +44,7 @@ class CheckpointRecord:
     isa: str  # ... and the same instruction set
     versions: tuple[tuple[str, str], ...]  # (package, version)
     elapsed: float  # training time so far, seconds
+    elapsed_cpu: float  # CPU time of it, all threads, seconds
     loss_average: float | None  # running averages shown to the user
     psnr_average: float | None
     order_position: int  # views of the current epoch already visited

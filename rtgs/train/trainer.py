@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import math
 import platform
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,6 +28,7 @@ from rtgs.train.checkpoint import (
     load_newest,
     save_checkpoint,
 )
+from rtgs.train.clock import Clock, ElapsedTime
 from rtgs.train.guard import check_loss, diverged
 from rtgs.train.memory import peak_memory_mb, start_peak_memory
 from rtgs.train.progress import Progress, SilentProgress, StepReport
@@ -52,6 +52,7 @@ class TrainSummary:
 
     steps: int  # done in all, resumed ones included
     seconds: float  # training time in all, resumed ones included
+    cpu_seconds: float  # CPU time of it, all threads: the same on a busy machine
     seconds_per_step: float  # of this process
     peak_memory_mb: float  # largest resident set during this training (elsewhere than on Linux: of the process)
     surfels: int  # in all sets
@@ -105,8 +106,8 @@ class Trainer:
         self._order = ViewOrder(len(scene.train), seed_for(seed, "views"))
         self._averages = RunningAverages()
         self._step = self.stage.from_step
-        self._elapsed_before = 0.0
-        self._began = time.monotonic()
+        self._elapsed_before = ElapsedTime()
+        self._clock = Clock()
         self._window: list[tuple[LossTerm, ...]] = []
         self._seed = seed
         self._settings = self._settings_of(self.stage)
@@ -122,7 +123,7 @@ class Trainer:
         start_peak_memory()
         resumed_from = self._resume()
         first = self._step
-        self._began = time.monotonic()
+        self._clock = Clock()
         self.progress.start(self.stage.name, first, self.stage.until)
         try:
             self._announce(resumed_from)
@@ -134,11 +135,13 @@ class Trainer:
         finally:
             self._flush_metrics()
             self.progress.close()
-        seconds = time.monotonic() - self._began
+        elapsed = self._clock.elapsed()
+        in_all = self._elapsed_before + elapsed
         return TrainSummary(
             steps=self._step,
-            seconds=self._elapsed_before + seconds,
-            seconds_per_step=seconds / max(self._step - first, 1),
+            seconds=in_all.wall,
+            cpu_seconds=in_all.cpu,
+            seconds_per_step=elapsed.wall / max(self._step - first, 1),
             peak_memory_mb=peak_memory_mb(),
             surfels=self._surfels(),
             loss=self._averages.loss if self._averages.loss is not None else math.nan,
@@ -241,7 +244,7 @@ class Trainer:
         self._order.load(OrderState(tensors["views.permutation"], record.order_position, tensors["views.generator"]))
         self._averages = RunningAverages(record.loss_average, record.psnr_average)
         self._step = record.step
-        self._elapsed_before = record.elapsed
+        self._elapsed_before = ElapsedTime(record.elapsed, record.elapsed_cpu)
         return record.step
 
     def _settings_of(self, stage: Stage) -> str:
@@ -259,6 +262,7 @@ class Trainer:
         return replace(record, settings=settings, settings_digest=digest(settings))
 
     def _record(self, order_position: int) -> CheckpointRecord:
+        elapsed = self._elapsed_before + self._clock.elapsed()
         return CheckpointRecord(
             step=self._step,
             settings_digest=digest(self._settings),
@@ -266,7 +270,8 @@ class Trainer:
             threads=torch.get_num_threads(),
             isa=core.isa(),
             versions=(("rtgs", rtgs.__version__), ("torch", torch.__version__), ("python", platform.python_version())),
-            elapsed=self._elapsed_before + time.monotonic() - self._began,
+            elapsed=elapsed.wall,
+            elapsed_cpu=elapsed.cpu,
             loss_average=self._averages.loss,
             psnr_average=self._averages.psnr,
             order_position=order_position,

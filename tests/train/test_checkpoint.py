@@ -38,6 +38,7 @@ def make(step: int = 10, settings: RunSettings | None = None) -> Checkpoint:
         "avx2",
         (("torch", "2"),),
         1 / 3,
+        2 / 3,
         0.1 + 0.2,
         None,
         order_position=4,

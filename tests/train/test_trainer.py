@@ -57,6 +57,7 @@ def test_training_learns_and_tells():
     assert summary.surfels == len(trainer.method.sets[0]) > 300
     assert summary.resumed_from is None
     assert summary.seconds >= summary.seconds_per_step > 0
+    assert summary.cpu_seconds > 0
     assert memory.closed == 1
     assert memory.notes[0] == "diffuse 0 300"
     assert any("no distortion loss: its weight is 0" in note for note in memory.notes)

@@ -1,0 +1,29 @@
+"""How long a training took: by the wall, and in CPU time, which is the same on a busy machine."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class ElapsedTime:
+    """A duration."""
+
+    wall: float = 0.0  # seconds
+    cpu: float = 0.0  # seconds of this process, all threads
+
+    def __add__(self, other: ElapsedTime) -> ElapsedTime:
+        return ElapsedTime(self.wall + other.wall, self.cpu + other.cpu)
+
+
+@dataclass(frozen=True)
+class Clock:
+    """Runs from when it is made."""
+
+    _wall: float = field(default_factory=time.monotonic)
+    _cpu: float = field(default_factory=time.process_time)
+
+    def elapsed(self) -> ElapsedTime:
+        """Time since the clock was made."""
+        return ElapsedTime(time.monotonic() - self._wall, time.process_time() - self._cpu)
