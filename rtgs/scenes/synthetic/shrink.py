@@ -12,7 +12,6 @@ def shrink_pictures(folder: Path) -> int:
     (mozjpeg), the coefficients stay.
     """
     import mozjpeg_lossless_optimization
-    import oxipng
 
     saved = 0
     for path in sorted(folder.rglob("*")):
@@ -20,8 +19,22 @@ def shrink_pictures(folder: Path) -> int:
             continue
         before = path.read_bytes()
         png = path.suffix == ".png"
-        after = oxipng.optimize_from_memory(before, level=4) if png else mozjpeg_lossless_optimization.optimize(before)
+        after = _smaller_png(before) if png else mozjpeg_lossless_optimization.optimize(before)
         if len(after) < len(before):
             path.write_bytes(after)
             saved += len(before) - len(after)
     return saved
+
+
+def _smaller_png(data: bytes) -> bytes:
+    """Channels and bits stay what readers expect: a black colour picture does not become a grey one."""
+    import oxipng
+
+    return oxipng.optimize_from_memory(
+        data,
+        level=4,
+        bit_depth_reduction=False,
+        color_type_reduction=False,
+        palette_reduction=False,
+        grayscale_reduction=False,
+    )
