@@ -86,10 +86,15 @@ class MappingSettings:
     focal_factor: float = 1.2
     """Focal length to start from in long sides of the photo, where EXIF says none."""
     init_min_angle: float = 16.0
-    """Degrees between the rays of the first pair; halved until a first pair is found, see ``init_trials``."""
+    """Degrees between the rays of the first pair."""
     init_trials: int = 3
-    """Attempts to start, each with half the angle and half the inliers of the one before."""
+    """Attempts, each with half the demands of the one before (angle and inliers of the first pair, inliers of every
+    pose), until ``good_registered`` of the photos have a pose; the one that places most photos counts."""
     init_min_inliers: int = 100
+    pose_min_inliers: int = 30
+    """Points of the model a photo must see to be placed."""
+    pose_min_ratio: float = 0.25
+    """Share of its matches with the model that must agree with its pose."""
     min_model: int = 3
     """Models of fewer photos do not count."""
     refine_principal_point: bool = False

@@ -24,6 +24,7 @@ from rtgs.prepare.settings import SfmSettings
 _PHOTOS_PER_CALL = 8  # features are searched in this many photos between two looks at the clock
 _PAIRS_PER_CALL = 400  # the matcher reads descriptors again in each call: fewer calls are faster
 _SAMPLES_PER_PHOTO = 400  # descriptors each photo gives to the words of retrieval
+_MIN_POSE_INLIERS = 10  # points a pose rests on at the very least
 _LOG_ERRORS = 2  # glog level: COLMAP itself stays silent below errors
 
 
@@ -237,9 +238,9 @@ def _match(
 
 
 def _map(photos: PhotoSet, place: Workplace, settings: SfmSettings, say: Say) -> tuple[list[Any], float]:
-    """COLMAP's models, most photos first; the first pair is searched with ever lower demands."""
+    """COLMAP's models, most photos first, of the attempt whose largest is largest; demands fall until it is enough."""
     ticker = Ticker(say, "photos with a pose", len(photos.photos))
-    models: list[Any] = []
+    best: list[Any] = []
     for trial in range(settings.mapping.init_trials):
         shutil.rmtree(place.models, ignore_errors=True)
         place.models.mkdir(parents=True)
@@ -248,9 +249,13 @@ def _map(photos: PhotoSet, place: Workplace, settings: SfmSettings, say: Say) ->
         else:
             models = _incremental(place, settings, 0.5**trial, ticker)
         models = [model for model in models if model.num_reg_images() >= settings.mapping.min_model]
-        if models or settings.mapping.mapper == "global":
+        models.sort(key=lambda model: -model.num_reg_images())
+        if models and (not best or models[0].num_reg_images() > best[0].num_reg_images()):
+            best = models
+        enough = settings.good_registered * len(photos.photos)
+        if settings.mapping.mapper == "global" or (best and best[0].num_reg_images() >= enough):
             break
-    return sorted(models, key=lambda model: -model.num_reg_images()), ticker.took
+    return best, ticker.took
 
 
 def _incremental(place: Workplace, settings: SfmSettings, leniency: float, ticker: Ticker) -> list[Any]:
@@ -265,6 +270,11 @@ def _incremental(place: Workplace, settings: SfmSettings, leniency: float, ticke
     options.ba_refine_principal_point = wanted.refine_principal_point
     options.mapper.init_min_tri_angle = wanted.init_min_angle * leniency
     options.mapper.init_min_num_inliers = max(settings.matching.min_inliers, round(wanted.init_min_inliers * leniency))
+    least = max(_MIN_POSE_INLIERS, round(wanted.pose_min_inliers * leniency))
+    options.mapper.abs_pose_min_num_inliers = least
+    options.mapper.abs_pose_min_inlier_ratio = wanted.pose_min_ratio * leniency
+    if leniency < 1:
+        options.min_num_matches = min(settings.matching.min_inliers, _MIN_POSE_INLIERS)
     registered = 2
 
     def next_image() -> None:
