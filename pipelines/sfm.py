@@ -78,7 +78,7 @@ def sfm(params: SfmParams, context: StepContext) -> None:
 
 STEP = StepKind(
     "sfm",
-    1,
+    2,
     sfm,
     helpers=(
         "rtgs.prepare.poses",
