@@ -18,7 +18,8 @@ from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, open_dict
 
-from pipelines.sweep import SweepJob, prepared, run_merged
+from pipelines.planning import Job
+from pipelines.sweep import prepared, run_merged
 from rtgs.config.compose import choices_from, without_hydra
 from rtgs.config.convert import to_run_config
 from rtgs.config.schema import open_schema
@@ -79,13 +80,11 @@ class RtgsDaskLauncher(Launcher):
         return config
 
 
-def _job(composed: DictConfig) -> SweepJob | None:
+def _job(composed: DictConfig) -> Job | None:
     """The job of a composed config; None when its values do not fit: then the job itself says so."""
     hydra = composed.hydra
     try:
-        return SweepJob(
-            *to_run_config(without_hydra(composed), choices_from(hydra.runtime.choices, hydra.overrides.task))
-        )
+        return Job(*to_run_config(without_hydra(composed), choices_from(hydra.runtime.choices, hydra.overrides.task)))
     except Exception as error:
         log.debug("left out of the merged plan: %s", error)
         return None

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
+from pipelines.planning import describe, remote_store
 from pipelines.sweep import Sweep, current_sweep, prepared_outcomes
 from rtgs.config.compose import VERSION_BASE, choices_from
 from rtgs.config.convert import to_run_config
@@ -38,15 +39,6 @@ class RunOutcome:
 class _Stores:
     local: Store
     remote: RemoteStore | None
-
-
-def remote_store(config: RunConfig) -> RemoteStore | None:
-    """The store shared with other machines, if the config names one.
-
-    Raises:
-        RemoteStoreError: its URL cannot be opened.
-    """
-    return RemoteStore(config.paths.remote) if config.paths.remote else None
 
 
 def execute(config: RunConfig, choices: Choices) -> RunOutcome:
@@ -113,14 +105,6 @@ def _tracked(
         folder = write_run_folder(config, choices, command, results)
         track_end(tracker, folder, results)
     return results, folder
-
-
-def describe(plan: Plan) -> str:
-    """One line: how many steps, how many are cached."""
-    text = f"{len(plan)} steps, {plan.hits} from the cache"
-    if fetched := sum(planned.remote for planned in plan):
-        text += f", {fetched} from the remote store"
-    return f"{text}, nothing to do" if plan.complete else text
 
 
 def _show(results: Sequence[StepResult], folder: Path) -> None:

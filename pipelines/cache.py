@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rtgs.errors import RtgsError
-from rtgs.pipeline import Artifact, RemoteStore, Store, topological
+from rtgs.pipeline import Artifact, RemoteStore, Store
 
 REMOTE_VARIABLE = "RTGS_REMOTE"
 
@@ -36,8 +36,8 @@ def main(words: list[str], root: Path) -> int:
 def _parser(root: Path) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         "rtgs cache",
-        description="The artifact store. push and pull take the words of `rtgs run` and move what that run is made of; "
-        "without words, everything.",
+        description="The artifact store. push and pull take the words of `rtgs run` and move what that run or sweep is "
+        "made of; without words, everything.",
     )
     parser.add_argument(
         "action",
@@ -121,12 +121,9 @@ def _recipes(words: list[str]) -> set[tuple[str, str]] | None:
     """(step, fingerprint) of everything the run of these words is made of; None without words: no choice made."""
     if not words:
         return None
-    from pipelines.app import friendly_overrides
-    from pipelines.graph import build_graph
-    from rtgs.config import compose
+    from pipelines.planning import steps_of_words
 
-    config, choices = compose(friendly_overrides(words))
-    return {(step.name, step.fingerprint) for step in topological(build_graph(config, choices).targets)}
+    return {(step.name, step.fingerprint) for step in steps_of_words(words)}
 
 
 def columns(rows: Sequence[Sequence[str]]) -> str:

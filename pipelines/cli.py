@@ -19,7 +19,7 @@ USAGE = f"""rtgs {__version__}: Gaussian models of scenes with glass and mirrors
 
   rtgs run [group=choice] [key=value]     train, render, measure, report; what is cached is not run again
   rtgs run synthesize scene=NAME|all      path-trace a described scene into a capture with known truth
-  rtgs plan [group=choice] [key=value]    what `rtgs run` with the same words would do, and why
+  rtgs plan [--multirun] [key=value]      what `rtgs run` with the same words would do, and why
   rtgs check FOLDER | scene=NAME          what is wrong with a capture, before any training
   rtgs report [RUN]                       where the report of the latest (or the named) run is
   rtgs show FILE.ply [--scene NAME]       pictures of any Gaussian splat; with a scene, measured on its test views
@@ -124,24 +124,13 @@ def run(words: list[str]) -> int:
 
 
 def plan(words: list[str]) -> int:
-    """``rtgs plan``: the steps of a run, cached or not, and why not."""
-    if words[:1] in (["-h"], ["--help"]):
-        print("rtgs plan [group=choice] [key=value]\n\nThe words of `rtgs run`; prints the plan and runs nothing.")
-        return 0
-    from pipelines.app import describe, friendly_overrides, remote_store
-    from pipelines.cache import columns
-    from pipelines.graph import build_graph
-    from pipelines.results import plan_rows
-    from rtgs.config import compose
-    from rtgs.pipeline import Store, make_plan
+    """``rtgs plan``: the steps of a run or of a sweep, cached or not, and why not."""
+    from pipelines.planning import HELP, plan_of_words
 
-    config, choices = compose(friendly_overrides(words))
-    graph = build_graph(config, choices)
-    planned = make_plan(graph.targets, Store(config.paths.store), remote_store(config))
-    rows = [("step", "key", "state", "why"), *(tuple(row.values()) for row in plan_rows(planned, graph.skipped))]
-    print(columns(rows))
-    print(f"\n{describe(planned)}")
-    return 0
+    if words[:1] in (["-h"], ["--help"]):
+        print(HELP)
+        return 0
+    return plan_of_words(words)
 
 
 def cache(words: list[str]) -> int:

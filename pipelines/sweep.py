@@ -9,23 +9,16 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
 
-from rtgs.config.schema import Choices, RunConfig
+from pipelines.planning import Job, describe, merge_jobs, remote_store
+from rtgs.config.schema import RunConfig
 from rtgs.errors import RtgsError
-from rtgs.pipeline import RemoteStore, Step, Store, SweepOutcomes, make_plan
+from rtgs.pipeline import Store, SweepOutcomes, make_plan
 from rtgs.pipeline.engine import DaskExecutor, EngineSettings, WorkerJob, open_client
 from rtgs.track import RunInfo
 from rtgs.track.source import git_tags
 
 log = logging.getLogger("rtgs")
 _PREPARED: ContextVar[SweepOutcomes | None] = ContextVar("prepared sweep", default=None)
-
-
-@dataclass(frozen=True)
-class SweepJob:
-    """One combination of a sweep."""
-
-    config: RunConfig
-    choices: Choices
 
 
 @dataclass(frozen=True)
@@ -53,27 +46,20 @@ def current_sweep() -> Sweep | None:
     return Sweep(identity, f"{experiment or 'sweep'} {identity}")
 
 
-def run_merged(jobs: Sequence[SweepJob], settings: EngineSettings) -> SweepOutcomes:
+def run_merged(jobs: Sequence[Job], settings: EngineSettings) -> SweepOutcomes:
     """Bring the steps of all jobs into the store, each once; a job whose graph cannot be built is left to fail alone.
 
     Raises:
         RtgsError: the cluster does not start, or the jobs disagree about where the store is.
     """
-    from pipelines.app import describe
-    from pipelines.graph import build_graph
-
-    targets: list[Step] = []
-    for job in jobs:
-        try:
-            targets += build_graph(job.config, job.choices).targets
-        except Exception as error:
-            log.debug("left out of the merged plan: %s", error)  # the job itself stops with it
-    if not targets:
+    merged = merge_jobs(jobs)
+    for title, problem in merged.problems:
+        log.debug("%s is left out of the merged plan: %s", title, problem)  # the job itself stops with it
+    if not merged.targets:
         return SweepOutcomes({})
     config = _common(jobs)
     store = Store(config.paths.store)
-    remote = RemoteStore(config.paths.remote) if config.paths.remote else None
-    plan = make_plan(targets, store, remote)
+    plan = make_plan(merged.targets, store, remote_store(config))
     log.info("%d jobs, %s", len(jobs), describe(plan))
     if plan.complete:
         return SweepOutcomes({})
@@ -81,7 +67,7 @@ def run_merged(jobs: Sequence[SweepJob], settings: EngineSettings) -> SweepOutco
         return DaskExecutor(client, _worker_job(config, settings)).attempt(plan)
 
 
-def _common(jobs: Sequence[SweepJob]) -> RunConfig:
+def _common(jobs: Sequence[Job]) -> RunConfig:
     first = jobs[0].config
     for job in jobs:
         if (job.config.paths, job.config.tracking) != (first.paths, first.tracking):

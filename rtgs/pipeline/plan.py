@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+
+import numpy as np
 
 from rtgs.errors import RtgsError
 from rtgs.pipeline.fingerprint import flatten
@@ -74,7 +76,7 @@ def make_plan(targets: Sequence[Step], store: Store, remote: RemoteStore | None 
     if not targets:
         raise RtgsError("nothing to plan: the graph has no target steps")
     planned: list[PlannedStep] = []
-    neighbours: dict[str, list[Manifest]] = {}
+    neighbours: dict[str, Neighbours] = {}
     for step in topological(targets):
         if store.find(step) is not None:
             planned.append(PlannedStep(step, True, ""))
@@ -83,23 +85,57 @@ def make_plan(targets: Sequence[Step], store: Store, remote: RemoteStore | None 
             planned.append(PlannedStep(step, False, f"will be fetched from {remote.url}", remote=True))
             continue
         if step.name not in neighbours:
-            neighbours[step.name] = [artifact.manifest for artifact in store.artifacts(step.name)]
-        reason = explain_miss(step, neighbours[step.name])
+            neighbours[step.name] = Neighbours([artifact.manifest for artifact in store.artifacts(step.name)])
+        reason = neighbours[step.name].explain_miss(step)
         if store.partial(step).exists():
             reason += "; resumes from its checkpoint"
         planned.append(PlannedStep(step, False, reason))
     return Plan(tuple(planned))
 
 
-def explain_miss(step: Step, manifests: Sequence[Manifest]) -> str:
-    """Why ``step`` is not cached, against the cached manifest of the same name with the fewest differences."""
-    if not manifests:
-        return "never ran here"
-    nearest = min((differences(step, manifest) for manifest in manifests), key=len)
-    if not nearest:
-        return "its artifact is broken"
-    rest = len(nearest) - _REASONS
-    return ", ".join(nearest[:_REASONS]) + (f" and {rest} more" if rest > 0 else "")
+class Neighbours:
+    """Cached manifests of one step name, among which the nearest is found for any number of misses.
+
+    Each recipe is a row of numbers, one column per key and one number per value of it, so that the differences to all
+    of them are counted in one comparison.
+    """
+
+    def __init__(self, manifests: Sequence[Manifest]) -> None:
+        self._manifests = tuple(manifests)
+        recipes = [_recipe_of(manifest) for manifest in manifests]
+        self._columns = {key: column for column, key in enumerate(sorted(set().union(*recipes)))}
+        self._codes: dict[tuple[str, str], int] = {}
+        self._rows = np.stack([self._row(recipe) for recipe in recipes]) if recipes else None
+
+    def _row(self, recipe: Mapping[str, str]) -> np.ndarray:
+        """The recipe as numbers, 0 for an absent key; keys that no manifest has are as far from all of them."""
+        row = np.zeros(len(self._columns), dtype=np.int32)
+        for key in recipe.keys() & self._columns.keys():
+            row[self._columns[key]] = self._codes.setdefault((key, recipe[key]), len(self._codes) + 1)
+        return row
+
+    def explain_miss(self, step: Step) -> str:
+        """Why ``step`` is not cached, against the cached manifest with the fewest differences."""
+        if self._rows is None:
+            return "never ran here"
+        row = self._row(_recipe_of(step))
+        nearest = differences(step, self._manifests[int((self._rows != row).sum(axis=1).argmin())])
+        if not nearest:
+            return "its artifact is broken"
+        rest = len(nearest) - _REASONS
+        return ", ".join(nearest[:_REASONS]) + (f" and {rest} more" if rest > 0 else "")
+
+
+def _recipe_of(source: Step | Manifest) -> dict[str, str]:
+    """Everything a fingerprint is made of, flat, values as text."""
+    if isinstance(source, Manifest):
+        params, upstream, tools = source.params, source.upstream, source.tools
+    else:
+        params, tools = source.recipe, dict(source.tools)
+        upstream = {other.name: other.fingerprint for other in source.upstream}
+    flat = {f"params.{key}": repr(value) for key, value in flatten(params).items()}
+    flat |= {f"upstream.{key}": value for key, value in upstream.items()}
+    return flat | {f"tools.{key}": str(value) for key, value in tools.items()} | {"version": str(source.version)}
 
 
 def differences(step: Step, manifest: Manifest) -> list[str]:

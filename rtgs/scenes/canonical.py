@@ -22,6 +22,7 @@ from rtgs.cameras import Camera
 from rtgs.scenes.capture import raise_errors
 from rtgs.scenes.findings import missing_files
 from rtgs.scenes.importers import read_capture
+from rtgs.scenes.once import remembered
 from rtgs.scenes.scene import Scene, View, select_views
 from rtgs.scenes.settings import CaptureError, SceneSettings
 from rtgs.scenes.truth import ViewTruth, truth_files
@@ -148,6 +149,7 @@ def _view(folder: Path, entry: _ViewEntry) -> View:
     )
 
 
+@remembered
 def capture_digest(settings: SceneSettings) -> str:
     """SHA-256 over names (relative to the capture), sizes and contents of all files an import of ``settings`` reads.
 

@@ -9,6 +9,7 @@ from rtgs.scenes.blender import is_blender, read_blender
 from rtgs.scenes.capture import Capture
 from rtgs.scenes.colmap import find_model, incomplete_model, read_colmap
 from rtgs.scenes.embedded import embedded_capture
+from rtgs.scenes.once import remembered
 from rtgs.scenes.settings import CaptureError, SceneSettings
 from rtgs.scenes.transforms import is_transforms, read_transforms
 
@@ -62,6 +63,7 @@ def find_format(root: Path, settings: SceneSettings) -> str | None:
     return "blender" if is_blender(root) else None
 
 
+@remembered
 def read_capture(settings: SceneSettings) -> Capture:
     """Read poses, lenses and points of a capture; no pixels.
 

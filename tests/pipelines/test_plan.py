@@ -1,13 +1,15 @@
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import make_dataclass, replace
 
+import numpy as np
 import pytest
 from toy import ToyParams, graph, train
 
 from rtgs.errors import RtgsError
 from rtgs.pipeline import InlineExecutor, Step, Store, make_plan
-from rtgs.pipeline.plan import topological
+from rtgs.pipeline.manifest import describe
+from rtgs.pipeline.plan import Neighbours, differences, topological
 
 
 @pytest.fixture
@@ -53,6 +55,23 @@ def test_a_checkpoint_is_announced(tmp_path, store):
     step = Step("train", 1, ToyParams(5.0), train, graph(tmp_path)[0].upstream)
     store.partial(step).mkdir(parents=True)
     assert make_plan([step], store).steps[-1].reason.endswith("resumes from its checkpoint")
+
+
+def test_the_nearest_artifact_has_the_fewest_differences(tmp_path):
+    names = ("a", "b", "c", "d")
+    random = np.random.default_rng(5)
+
+    def step(values) -> Step:
+        params = make_dataclass("Drawn", [(name, int) for name in names], frozen=True)(*map(int, values))
+        return Step("train", 1, params, train)
+
+    cached = [describe(step(random.integers(0, 3, 4)), tmp_path, 1.0, "") for _ in range(30)]
+    neighbours = Neighbours(cached)
+    for _ in range(30):
+        missing = step(random.integers(0, 4, 4))
+        fewest = min(len(differences(missing, manifest)) for manifest in cached)
+        told = neighbours.explain_miss(missing)
+        assert told == "its artifact is broken" if fewest == 0 else told.count("->") == min(fewest, 3)
 
 
 def test_an_empty_graph_is_refused(store):

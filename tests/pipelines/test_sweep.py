@@ -64,6 +64,12 @@ def test_a_sweep_is_one_plan_and_every_job_has_its_results(capture, tmp_path, ca
         "ablation=none,no_normal_loss",
         "seed=0,1",
     ]
+    jobs = [word for word in words[1:] if not word.startswith("table.")]
+    assert main(["plan", *jobs]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-1] == "4 jobs, 20 steps before merging; 17 steps, 0 from the cache"
+    assert [line.split()[4] for line in lines if line.startswith("import_scene")] == ["4"]
+
     assert main(words) == 0
     captured = capsys.readouterr()
     store = Store(tmp_path / "store")
@@ -95,6 +101,24 @@ def test_a_sweep_is_one_plan_and_every_job_has_its_results(capture, tmp_path, ca
         path for path in (tmp_path / "tracking").rglob("events.jsonl") if not path.parent.name.startswith("sweep_")
     ]
     assert len(again) == len(starts) - 1  # no job is recorded twice; only the table goes to the new sweep
+
+    assert main(["plan", *jobs, "method.loss.l1=0.8,0.7"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-1] == "8 jobs, 40 steps before merging; 33 steps, 13 from the cache"  # the four reports name the key
+    missing = [line for line in lines if line.startswith("train_diffuse") and "to run" in line]
+    assert len(missing) == 4
+    assert all(line.endswith("method.loss.l1: 0.8 -> 0.7") for line in missing)
+
+
+def test_the_plan_of_a_sweep_names_the_jobs_that_could_not_start(capture, capsys):
+    words = ["plan", "-m", *QUICK, "scene=capture", f"scene.path={capture},/no/such/folder", "method=2dgs,3dgs"]
+    assert main([*words, "ablation=no_normal_loss"]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-4] == "1 jobs, 5 steps before merging; 5 steps, 0 from the cache"
+    assert sum("takes nothing away from method 3dgs" in line for line in lines[-3:]) == 2
+    assert any("capture folder /no/such/folder does not exist" in line for line in lines[-3:])
+    assert main(["plan", "-m", "--cfg", "job"]) == 1
+    assert "unknown option --cfg" in capsys.readouterr().err
 
 
 def test_a_failing_job_leaves_the_others_alone_and_says_why(capture, tmp_path, capsys):
