@@ -1,4 +1,4 @@
-"""The graph of a run: (sfm, normals ->) import -> one training step per stage (-> mesh) -> render, evaluate, report.
+"""The graph of a run: (sfm, masks, normals ->) import -> one step per stage (-> mesh) -> render, evaluate, report.
 
 Pure: from a config to steps with parameters; nothing runs here. Each step is given only what it reads.
 """
@@ -12,6 +12,7 @@ from pipelines import (
     evaluate,
     extract_mesh,
     import_scene,
+    masks,
     normals,
     render,
     report,
@@ -33,6 +34,7 @@ TRAINING: Mapping[str, StepKind] = {"diffuse": train_diffuse.STEP, "reflection":
 
 KINDS: tuple[StepKind, ...] = (
     sfm.STEP,
+    masks.STEP,
     normals.STEP,
     import_scene.STEP,
     *TRAINING.values(),

@@ -65,6 +65,8 @@ def import_scene(params: ImportParams, context: StepContext) -> None:
     if "sfm" in context.inputs:
         split = settings.split_file and str(Path(params.path, settings.split_file).absolute())
         settings = replace(settings, path=str(context.inputs["sfm"]), split_file=split)
+    if "masks" in context.inputs:
+        settings = replace(settings, masks_dir=str((context.inputs["masks"] / "masks").absolute()))
     if "normals" in context.inputs:
         maps = str((context.inputs["normals"] / "normals").absolute())
         settings = replace(settings, normals_dir=maps, normals_frame="opencv")

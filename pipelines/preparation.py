@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pipelines import import_scene, normals, sfm
+from pipelines.mask_plan import mask_step, plan_masks
 from rtgs.config.schema import RunConfig
 from rtgs.pipeline import Step
 from rtgs.prepare.source import Source, find_source
@@ -34,7 +35,7 @@ def prepare(config: RunConfig) -> Preparation:
     Raises:
         CaptureError: the capture cannot be read.
         PrepareError: it has no poses and none may or can be looked for.
-        MissingWeights: ``normals.use=always`` and no network.
+        MissingWeights: ``normals.use=always`` or ``masks=grounded_sam2`` and no network.
     """
     source = find_source(config.scene, config.sfm)
     steps: list[Step] = []
@@ -45,11 +46,17 @@ def prepare(config: RunConfig) -> Preparation:
     else:
         params = import_scene.prepared_params(config.scene, source.path)
         steps.append(sfm.sfm_step(source, config.scene, config.sfm))
+    before = tuple(steps)
+    planned = plan_masks(config, source)
+    if planned.method:
+        steps.append(mask_step(config, source, planned.method, params, before))
+    else:
+        skipped.append(SkippedStep("masks", planned.why))
     why = _why_no_normals(config, source)
     if why:
         skipped.append(SkippedStep("normals", why))
     else:
-        steps.append(_normals_step(config, params, tuple(steps)))
+        steps.append(_normals_step(config, params, before))
     return Preparation(import_scene.STEP.step(params, *steps), tuple(steps), tuple(skipped))
 
 

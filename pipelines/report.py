@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from rtgs.evaluate.evaluate import EvaluationTable
     from rtgs.report.figures import Curve
-    from rtgs.report.page import MeshFigure, ReportView, StepLine
+    from rtgs.report.page import Decision, MeshFigure, ReportView, StepLine
 
 PAGE = "report.html"
 
@@ -52,6 +52,7 @@ def report(params: ReportParams, context: StepContext) -> None:
     manifest = Manifest.read(training)
     assert manifest is not None
     decisions = [Decision(*item) for item in params.decisions]
+    decisions += _masks(inputs)
     decisions += [Decision(**item) for item in summary["decisions"]]  # pyright: ignore[reportGeneralTypeIssues]
     data = ReportData(
         title=params.title,
@@ -69,6 +70,17 @@ def report(params: ReportParams, context: StepContext) -> None:
     size = write_report(context.out / PAGE, data)
     context.log.info("report of %.1f MB", size / 1e6)
     context.tracker.artifact(context.out / PAGE)
+
+
+def _masks(inputs: Mapping[str, Path]) -> list[Decision]:
+    """How the masks were made: a classical fallback is named as such."""
+    if "masks" not in inputs:
+        return []
+    from rtgs.prepare.masks_report import MaskReport
+    from rtgs.report.page import Decision
+
+    made = MaskReport.read(inputs["masks"])
+    return [Decision("masks", "; ".join((str(made), *made.notes)))]
 
 
 def _views(table: EvaluationTable, inputs: Mapping[str, Path], count: int) -> tuple[ReportView, ...]:

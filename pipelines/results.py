@@ -20,6 +20,7 @@ from rtgs.config.schema import Choices, RunConfig
 from rtgs.errors import RtgsError
 from rtgs.pipeline import Plan, StepResult, Store
 from rtgs.pipeline.fingerprint import flatten
+from rtgs.prepare.masks_report import FILES as MASK_FILES
 from rtgs.prepare.quality import PICTURE_FILE, REPORT_FILE
 from rtgs.track import RunInfo, Tracker
 from rtgs.track.source import git_tags
@@ -88,6 +89,8 @@ def _fill_run_folder(
         shutil.copyfile(mesh, folder / mesh.name)
     for name in (REPORT_FILE, PICTURE_FILE) if "sfm" in places else ():
         shutil.copyfile(places["sfm"] / name, folder / name)
+    for name in MASK_FILES if "masks" in places else ():
+        shutil.copyfile(places["masks"] / name, folder / name)
     (folder / "config.yaml").write_text(config_yaml(config), encoding="utf-8")
     finished = datetime.now(UTC).isoformat(timespec="seconds")
     record = RunRecord(str(config.name), command, finished, asdict(choices), steps)

@@ -46,6 +46,6 @@ def choices_from(groups: Mapping[str, object], overrides: Sequence[str]) -> Choi
     """Hydra's record of chosen files and overrides as :class:`Choices`."""
     names = {str(key): str(value) for key, value in groups.items() if value is not None}
     chosen = {key: names.get(key, "") for key in ("method", "preset", "ablation", "experiment")}
-    told_otherwise = {*names, "hydra", "paths.root", "name", "threads"} - {"sfm", "normals"}
+    told_otherwise = {*names, "hydra", "paths.root", "name", "threads"} - {"sfm", "masks", "normals"}
     keys = [item for item in overrides if item.split("=", 1)[0].lstrip("+~") not in told_otherwise]
     return Choices(**chosen, scene_file=names.get("scene", ""), overrides=tuple(keys))

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from rtgs.mesh.tsdf import TsdfSettings
+from rtgs.prepare.masks_settings import MaskSettings
 from rtgs.prepare.settings import NormalSettings, SfmSettings
 from rtgs.scenes.settings import SceneSettings
 from rtgs.train.settings import MethodSettings, ScheduleSettings
@@ -124,6 +125,7 @@ class RunConfig:
 
     scene: SceneSettings = field(default_factory=SceneSettings)
     sfm: SfmSettings = field(default_factory=SfmSettings)
+    masks: MaskSettings = field(default_factory=MaskSettings)
     normals: NormalSettings = field(default_factory=NormalSettings)
     method: MethodSettings = field(default_factory=MethodSettings)
     schedule: ScheduleSettings = field(default_factory=ScheduleSettings)

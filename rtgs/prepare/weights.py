@@ -31,6 +31,10 @@ __all__ = [
 ]
 
 _ANY_EXPORT = "torch.onnx.export of the authors' model with input (1, 3, H, W), names as in docs/prepare.md"
+_SAM2_EXPORT = (
+    "take onnx/{part}.onnx and its .onnx_data (which keeps its name) of the published export "
+    "onnx-community/sam2.1-hiera-tiny-ONNX, or python -m samexporter.export_sam2 (github.com/vietanhdev/samexporter)"
+)
 
 PREPARATION: tuple[PretrainedFile, ...] = (
     PretrainedFile(
@@ -44,12 +48,12 @@ PREPARATION: tuple[PretrainedFile, ...] = (
         export="take onnx/model.onnx of the published export onnx-community/grounding-dino-tiny-ONNX",
     ),
     PretrainedFile(
-        name="grounding_dino_vocab",
-        filename="grounding_dino/vocab.txt",
+        name="grounding_dino_tokenizer",
+        filename="grounding_dino/tokenizer.json",
         sha256="",
-        megabytes=0.23,
+        megabytes=0.7,
         licence="Apache-2.0",
-        source="huggingface.co/IDEA-Research/grounding-dino-tiny (vocab.txt of bert-base-uncased)",
+        source="huggingface.co/onnx-community/grounding-dino-tiny-ONNX (tokenizer.json of bert-base-uncased)",
         used_for="masks: the words of the text prompt",
     ),
     PretrainedFile(
@@ -60,7 +64,7 @@ PREPARATION: tuple[PretrainedFile, ...] = (
         licence="Apache-2.0",
         source="github.com/facebookresearch/sam2, checkpoints of SAM 2.1 (hiera tiny to large)",
         used_for="masks: picture features",
-        export="python -m samexporter.export_sam2 (github.com/vietanhdev/samexporter)",
+        export=_SAM2_EXPORT.format(part="vision_encoder"),
     ),
     PretrainedFile(
         name="sam2_decoder",
@@ -70,7 +74,7 @@ PREPARATION: tuple[PretrainedFile, ...] = (
         licence="Apache-2.0",
         source="github.com/facebookresearch/sam2, checkpoints of SAM 2.1 (hiera tiny to large)",
         used_for="masks: from boxes to masks",
-        export="python -m samexporter.export_sam2 (github.com/vietanhdev/samexporter)",
+        export=_SAM2_EXPORT.format(part="prompt_encoder_mask_decoder"),
     ),
     PretrainedFile(
         name="stablenormal",

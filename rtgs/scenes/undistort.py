@@ -182,6 +182,17 @@ def project(lens: Lens, local: np.ndarray) -> np.ndarray:
     return np.asarray(_colmap_camera(lens).img_from_cam(local / local[:, 2:])).reshape(-1, 2)
 
 
+def unproject(lens: Lens, pixels: np.ndarray) -> np.ndarray:
+    """Rays (N, 3) with z = 1 of pixels (N, 2) of the distorted image, centres at i + 0.5: :func:`project` undone."""
+    if lens.is_pinhole:
+        fx, fy, cx, cy = lens.pinhole().params
+        plane = (np.asarray(pixels, dtype=np.float64) - (cx, cy)) / (fx, fy)
+    else:
+        points = np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 2)
+        plane = np.asarray(_colmap_camera(lens).cam_from_img(points), dtype=np.float64).reshape(-1, 2)
+    return np.column_stack([plane, np.ones(len(plane))])
+
+
 def undistort_image(image: np.ndarray, lens: Lens) -> np.ndarray:
     """Resample a float32 photo (H, W, C) to the pinhole of ``lens`` by bilinear interpolation; edge pixels repeat."""
     if lens.is_pinhole:

@@ -127,10 +127,11 @@ def test_the_plan_tells_why(first, words, capsys):
     assert main(["plan", *words[1:], "ablation=no_normal_loss"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[1].split() == ["sfm", "skipped", "poses", "are", "given", "(transforms)"]
-    assert lines[2].split()[:2] == ["normals", "skipped"]
-    assert lines[3].split()[0::2][:2] == ["import_scene", "cached"]
-    assert "to run   method.loss.normal: 0.05 -> 0.0" in lines[4]
-    assert "upstream train_diffuse changed" in lines[5]
+    assert lines[2].split()[:2] == ["masks", "skipped"]
+    assert lines[3].split()[:2] == ["normals", "skipped"]
+    assert lines[4].split()[0::2][:2] == ["import_scene", "cached"]
+    assert "to run   method.loss.normal: 0.05 -> 0.0" in lines[5]
+    assert "upstream train_diffuse changed" in lines[6]
     assert lines[-1] == "5 steps, 1 from the cache"
 
 

@@ -42,7 +42,7 @@ def plan(capsys, *words: str) -> list[list[str]]:
 
 def test_photos_become_a_table(photos, tmp_path, capsys):
     words = [f"scene={photos}", *QUICK]
-    assert [row[0] for row in plan(capsys, *words)[1:4]] == ["normals", "sfm", "import_scene"]
+    assert [row[0] for row in plan(capsys, *words)[1:5]] == ["masks", "normals", "sfm", "import_scene"]
     assert main(["run", *words]) == 0
     shown = capsys.readouterr().out
     assert "PSNR" in shown

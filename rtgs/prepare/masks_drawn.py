@@ -1,0 +1,169 @@
+"""What a person marked in a few photos: boxes and clicks for GrabCut, corners of flat panes; a file beside the photos.
+
+units: pixels                # of the photo, x right, y down; or `fraction`, of its width and height
+panes:                       # flat glass: the same corners in the same order in two photos or more
+  door:
+    IMG_01.jpg: [[120, 80], [430, 92], [425, 610], [118, 600]]
+    IMG_07.jpg: [[101, 85], [398, 70], [402, 598], [99, 611]]
+cutouts:                     # anything else: a box around it, or a few clicks
+  IMG_03.jpg: {box: [100, 60, 420, 560], inside: [[250, 300]], outside: [[110, 70]]}
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rtgs.prepare.errors import PrepareError
+from rtgs.scenes.capture import list_some
+
+_KEYS = ("units", "panes", "cutouts")
+_CUTOUT_KEYS = ("box", "inside", "outside")
+UNITS = ("pixels", "fraction")
+
+
+@dataclass(frozen=True)
+class Cutout:
+    """Marks on one photo; coordinates as the file gives them."""
+
+    box: tuple[float, ...]  # left, top, right, bottom; empty: none
+    inside: np.ndarray  # (N, 2) clicks on the object
+    outside: np.ndarray  # (M, 2) clicks beside it
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A file of marks. Keys of photos are the names of the capture's views."""
+
+    path: Path
+    fraction: bool  # coordinates are shares of width and height
+    panes: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)  # pane -> photo -> (K, 2) corners
+    cutouts: dict[str, Cutout] = field(default_factory=dict)
+
+    def shares(self, points: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+        """Coordinates (N, 2) as shares of (width, height) of the photo they were drawn on."""
+        return points if self.fraction else points / np.asarray(size, dtype=np.float64)
+
+    @property
+    def marked(self) -> tuple[str, ...]:
+        """The photos with a mark, in name order."""
+        return tuple(sorted({*self.cutouts, *(name for corners in self.panes.values() for name in corners)}))
+
+
+def read_drawing(path: Path, views: Iterable[str]) -> Drawing:
+    """Read a file of marks; photos may be named in full, without sub-folder, or without suffix.
+
+    Raises:
+        PrepareError: not there, not of this form, or about photos the capture does not have.
+    """
+    content = _parse(path)
+    units = content.get("units", "pixels")
+    if units not in UNITS:
+        raise PrepareError(f"{path}: units={units!r} is unknown: choose one of {', '.join(UNITS)}")
+    names = tuple(views)
+    panes = {
+        str(pane): {
+            _photo(path, photo, names): _points(path, f"pane {pane}, {photo}", corners, least=3)
+            for photo, corners in _mapping(path, f"panes.{pane}", photos).items()
+        }
+        for pane, photos in _mapping(path, "panes", content.get("panes") or {}).items()
+    }
+    cutouts = {
+        _photo(path, photo, names): _cutout(path, str(photo), marks)
+        for photo, marks in _mapping(path, "cutouts", content.get("cutouts") or {}).items()
+    }
+    for pane, photos in panes.items():
+        counts = {len(corners) for corners in photos.values()}
+        if len(counts) > 1:
+            listed = list_some(f"{name}: {len(corners)}" for name, corners in sorted(photos.items()))
+            raise PrepareError(
+                f"{path}: pane {pane} has different numbers of corners ({listed}): draw the same corners in the same "
+                "order in every photo; a corner outside a photo may have coordinates outside it"
+            )
+    drawing = Drawing(path, units == "fraction", panes, cutouts)
+    if not drawing.marked:
+        raise PrepareError(f"{path} marks nothing: give panes or cutouts (docs/prepare.md shows both)")
+    return drawing
+
+
+def drawn_kinds(path: Path) -> tuple[str, ...]:
+    """Which of ``panes`` and ``cutouts`` a file of marks has.
+
+    Raises:
+        PrepareError: not there, or not of this form.
+    """
+    content = _parse(path)
+    return tuple(key for key in ("panes", "cutouts") if content.get(key))
+
+
+def _parse(path: Path) -> dict[str, Any]:
+    import yaml
+
+    if not path.is_file():
+        raise PrepareError(
+            f"{path} does not exist: write the boxes, clicks or corners into it (docs/prepare.md shows how), or name "
+            "it with masks.drawn.file"
+        )
+    try:
+        text = path.read_text(encoding="utf-8")
+        content = json.loads(text) if path.suffix.lower() == ".json" else yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError) as error:
+        raise PrepareError(f"{path} cannot be read: {' '.join(str(error).split())[:200]}") from error
+    if not isinstance(content, dict):
+        raise PrepareError(f"{path} holds {type(content).__name__}, not the keys {', '.join(_KEYS)}")
+    for key in content:
+        if key not in _KEYS:
+            close = difflib.get_close_matches(str(key), _KEYS, n=1)
+            hint = f"; did you mean {close[0]}?" if close else ""
+            raise PrepareError(f"{path}: unknown key {key!r}: give {', '.join(_KEYS)}{hint}")
+    return content
+
+
+def _mapping(path: Path, where: str, value: object) -> Mapping[Any, Any]:
+    if not isinstance(value, dict):
+        raise PrepareError(f"{path}: {where} is {type(value).__name__}, not photo names with marks")
+    return value
+
+
+def _photo(path: Path, named: object, views: tuple[str, ...]) -> str:
+    text = str(named)
+    if text in views:
+        return text
+    fitting = [view for view in views if Path(view).name == text or Path(view).stem == text]
+    if len(fitting) == 1:
+        return fitting[0]
+    if fitting:
+        raise PrepareError(f"{path}: {text} could be any of {list_some(fitting, 4)}: name it with its sub-folder")
+    close = difflib.get_close_matches(text, views, n=1)
+    hint = f"did you mean {close[0]}?" if close else f"there are {list_some(views, 4)}"
+    raise PrepareError(f"{path}: no photo {text} with a pose in the capture; {hint}")
+
+
+def _points(path: Path, where: str, value: object, least: int = 0) -> np.ndarray:
+    try:
+        points = np.asarray(value if value is not None else [], dtype=np.float64).reshape(-1, 2)
+    except (TypeError, ValueError) as error:
+        raise PrepareError(f"{path}: {where} is {value!r}, not a list of [x, y]") from error
+    if len(points) < least or not np.isfinite(points).all():
+        raise PrepareError(f"{path}: {where} has {len(points)} corners: give at least {least} finite [x, y]")
+    return points
+
+
+def _cutout(path: Path, photo: str, marks: object) -> Cutout:
+    if not isinstance(marks, dict) or not marks or set(marks) - set(_CUTOUT_KEYS):
+        raise PrepareError(
+            f"{path}: cutout {photo} is {marks!r}: give box: [left, top, right, bottom], inside, outside"
+        )
+    box = tuple(_points(path, f"the box of {photo}", marks.get("box")).reshape(-1).tolist())
+    if box and not (len(box) == 4 and box[0] < box[2] and box[1] < box[3]):
+        raise PrepareError(f"{path}: the box of {photo} is {list(box)}: give [left, top, right, bottom]")
+    inside, outside = (_points(path, f"{key} of {photo}", marks.get(key)) for key in ("inside", "outside"))
+    if not box and not len(inside):
+        raise PrepareError(f"{path}: cutout {photo} has neither a box nor a click inside: GrabCut needs one of them")
+    return Cutout(box, inside, outside)
