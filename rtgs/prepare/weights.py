@@ -45,7 +45,8 @@ PREPARATION: tuple[PretrainedFile, ...] = (
         licence="Apache-2.0",
         source="huggingface.co/IDEA-Research/grounding-dino-tiny",
         used_for="masks: boxes from words",
-        export="take onnx/model.onnx of the published export onnx-community/grounding-dino-tiny-ONNX",
+        export="take onnx/model.onnx of the published export onnx-community/grounding-dino-tiny-ONNX, or "
+        "python -m rtgs.prepare.masks_export",
     ),
     PretrainedFile(
         name="grounding_dino_tokenizer",
