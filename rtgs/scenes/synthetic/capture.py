@@ -36,6 +36,7 @@ from rtgs.scenes.synthetic.viewpoints import cameras as make_cameras
 from rtgs.scenes.truth import TRUTH_FOLDER, ViewTruth, srgb_from_linear, write_truth
 
 _SIDES = {"image": "images", "mask": "masks", "normal": "normals", "truth": TRUTH_FOLDER}
+_NORMAL_LEVELS = 127  # per axis: half a degree, where the estimator errs by some; 8 bits would be noise in the files
 
 Progress = Callable[[str, float], None]
 """Called with a view's name and the share of the work that is done, 0..1."""
@@ -111,8 +112,8 @@ def _write_view(tracer: PathTracer, camera: Camera, index: int, settings: Captur
         Image.fromarray(masked).save(folder / "mask.png", optimize=True)
     rng = np.random.default_rng((settings.seed, index))
     mono = perturbed_normals(geometry.normal, settings.normal_tilt, settings.normal_noise, rng)
-    encoded = np.clip((shrunk_normals(mono, settings.normal_scale) + 1) * 127.5 + 0.5, 0, 255).astype(np.uint8)
-    Image.fromarray(encoded).save(folder / "normal.png", optimize=True)
+    levels = np.rint((shrunk_normals(mono, settings.normal_scale) + 1) * (_NORMAL_LEVELS / 2))
+    Image.fromarray((levels * (254 // _NORMAL_LEVELS)).astype(np.uint8)).save(folder / "normal.png", optimize=True)
     if settings.has_truth(index):
         write_truth(folder / "truth", _truth(layers, geometry, specular))
     ViewRecord(

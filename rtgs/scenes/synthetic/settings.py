@@ -38,7 +38,7 @@ class CaptureSettings:
     the time and with a bias, see :mod:`rtgs.scenes.synthetic.lightmap`. Not in Mitsuba's scalar variant."""
     samples: int = 32
     """Paths a pixel of training views."""
-    test_samples: int = 96
+    test_samples: int = 256
     """Paths a pixel of test views, rendered as two halves that measure their noise."""
     test_every: int = 8
     """Views whose index is divisible by it are test views, as the importer splits them (methods.md 8.1)."""
