@@ -5,24 +5,49 @@ from __future__ import annotations
 from dataclasses import replace
 
 from rtgs.optics.settings import OpticsSettings
-from rtgs.train.settings import LossSettings, MethodSettings, OptimizerSettings, ReflectionSettings
+from rtgs.train.settings import (
+    LossSettings,
+    MethodSettings,
+    OptimizerSettings,
+    ReflectionSettings,
+    TransmittanceSettings,
+)
 from rtgs.train.specular_settings import MaterialSettings
 
 _SECOND_STAGE_LOSSES = ("perceptual", "specular")
+_THIRD_STAGE_LOSSES = ("transmission_depth",)
 _MATERIAL_RATES = ("specular_logits", "roughness_logits", "f0_logits")
 
 
 def stage_settings(settings: MethodSettings, stage: str) -> MethodSettings:
-    """The settings as the stage of this name sees them: "diffuse" reads nothing of materials, optics and reflection."""
-    if stage != "diffuse":
-        return settings
-    default_loss, default_rates = LossSettings(), OptimizerSettings()
-    losses = {name: getattr(default_loss, name) for name in vars(default_loss) if name.startswith(_SECOND_STAGE_LOSSES)}
-    return replace(
-        settings,
-        materials=MaterialSettings(),
-        optics=OpticsSettings(),
-        reflection=ReflectionSettings(),
-        loss=replace(settings.loss, **losses),
-        optimizer=replace(settings.optimizer, **{name: getattr(default_rates, name) for name in _MATERIAL_RATES}),
-    )
+    """The settings as the stage of this name sees them.
+
+    "diffuse" reads nothing of materials, optics, reflection and transmittance; "reflection" nothing of transmittance,
+    and L_spec only where it starts before the third stage does.
+    """
+    if stage == "diffuse":
+        rates = {name: getattr(OptimizerSettings(), name) for name in _MATERIAL_RATES}
+        return replace(
+            settings,
+            materials=MaterialSettings(),
+            optics=OpticsSettings(),
+            reflection=ReflectionSettings(),
+            transmittance=_UNREAD,
+            loss=_without_losses(settings.loss, (*_SECOND_STAGE_LOSSES, *_THIRD_STAGE_LOSSES)),
+            optimizer=replace(settings.optimizer, **rates),
+        )
+    if stage == "reflection":
+        masks = settings.transmittance.enabled and settings.loss.specular_start < settings.transmittance.start
+        unread = _THIRD_STAGE_LOSSES if masks else (*_THIRD_STAGE_LOSSES, "specular")
+        # The start stays where L_spec is read, so that this function finds the same when it is asked again.
+        kept = replace(_UNREAD, enabled=True, start=settings.transmittance.start) if masks else _UNREAD
+        return replace(settings, transmittance=kept, loss=_without_losses(settings.loss, unread))
+    return settings
+
+
+_UNREAD = TransmittanceSettings(enabled=False)
+
+
+def _without_losses(loss: LossSettings, prefixes: tuple[str, ...]) -> LossSettings:
+    default = LossSettings()
+    return replace(loss, **{name: getattr(default, name) for name in vars(default) if name.startswith(prefixes)})

@@ -36,9 +36,9 @@ SurfelArrays geometry_arrays(const Floats& means, const Floats& tangent_u, const
 // One trace: made by the forward pass, kept alive by autograd until the backward pass is done.
 class Tracing {
  public:
-  Tracing(float transmittance_cutoff, float alpha_cutoff, int sh_degree, bool last_sh, const std::string& order,
-          int threads)
-      : isa_(active_isa()), options_{transmittance_cutoff, alpha_cutoff, last_sh, threads < 1 ? 1 : threads},
+  Tracing(float transmittance_cutoff, float alpha_cutoff, int sh_degree, bool last_sh, bool raw_sh,
+          const std::string& order, int threads)
+      : isa_(active_isa()), options_{transmittance_cutoff, alpha_cutoff, last_sh, raw_sh, threads < 1 ? 1 : threads},
         sh_degree_(sh_degree), order_(order), memory_(TraceMemoryPool::instance().take()) {
     if (order != "given" && order != "sorted" && order != "auto")
       throw std::invalid_argument("trace: order '" + order + "' is not one of given, sorted, auto");
@@ -222,8 +222,9 @@ void bind_trace(nb::module_& m) {
       .def_prop_ro("surfels", &SurfelTree::surfels, "number of surfels of the last build")
       .def_prop_ro("surface_cost", &SurfelTree::surface_cost, "expected tests of a ray that meets the root; 0 if empty");
   nb::class_<Tracing>(m, "Tracing", "One trace of rays through surfels; see rtgs/render/trace.py.")
-      .def(nb::init<float, float, int, bool, const std::string&, int>(), nb::arg("transmittance_cutoff"),
-           nb::arg("alpha_cutoff"), nb::arg("sh_degree"), nb::arg("last_sh"), nb::arg("order"), nb::arg("threads"))
+      .def(nb::init<float, float, int, bool, bool, const std::string&, int>(), nb::arg("transmittance_cutoff"),
+           nb::arg("alpha_cutoff"), nb::arg("sh_degree"), nb::arg("last_sh"), nb::arg("raw_sh"),
+           nb::arg("order"), nb::arg("threads"))
       .def("forward", &Tracing::forward, nb::arg("tree"), nb::arg("means"), nb::arg("tangent_u"), nb::arg("tangent_v"),
            nb::arg("scales"), nb::arg("opacities"), nb::arg("features").none(), nb::arg("sh_dc").none(),
            nb::arg("sh_rest").none(), nb::arg("origins"), nb::arg("directions"), nb::arg("t_min_each").none(),

@@ -44,7 +44,7 @@ struct TraceRays {
 
 struct TraceOptionsNative {
   float transmittance_cutoff, alpha_cutoff;
-  bool last_sh;
+  bool last_sh, raw_sh;
   int threads;
 };
 

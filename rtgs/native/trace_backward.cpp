@@ -98,7 +98,7 @@ void PacketBackward::load_upstream() {
 }
 
 void PacketBackward::load_harmonics() {
-  packet_basis(args_.surfels.degree, rays_.unit_direction(), basis_);
+  packet_basis(args_.surfels.degree, rays_.color_direction(args_.options.raw_sh), basis_);
   const int rest = rest_count(args_.surfels.degree);
   for (int lane = 0; lane < kLanes; ++lane) {
     RayRow& row = ray_rows_[lane];
@@ -315,7 +315,7 @@ void PacketBackward::write_rays() {
   if (args_.options.last_sh)
     for (vfloat& v : to_direction_) v = broadcast(0.f);
   if (layout_.coefficients) {
-    const Direction d = rays_.unit_direction();
+    const Direction d = rays_.color_direction(args_.options.raw_sh);
     vfloat to_basis[kMostColumns];
     for (vfloat& v : to_basis) v = broadcast(0.f);
     for (int k = 0; k < rest_count(args_.surfels.degree); ++k)
@@ -326,11 +326,12 @@ void PacketBackward::write_rays() {
     Direction g = args_.surfels.degree == 1   ? sh_derivative<1>(d, to_basis)
                   : args_.surfels.degree == 2 ? sh_derivative<2>(d, to_basis)
                                               : sh_derivative<3>(d, to_basis);
-    const vfloat along = g.x * d.x + g.y * d.y + g.z * d.z;
-    const vfloat inverse = where(gt(rays_.length, broadcast(0.f)), 1.f / max(rays_.length, broadcast(1e-37f)));
-    to_direction_[0] += (g.x - along * d.x) * inverse;
-    to_direction_[1] += (g.y - along * d.y) * inverse;
-    to_direction_[2] += (g.z - along * d.z) * inverse;
+    if (!args_.options.raw_sh) {
+      const vfloat along = g.x * d.x + g.y * d.y + g.z * d.z;
+      const vfloat inverse = where(gt(rays_.length, broadcast(0.f)), 1.f / max(rays_.length, broadcast(1e-37f)));
+      g = {(g.x - along * d.x) * inverse, (g.y - along * d.y) * inverse, (g.z - along * d.z) * inverse};
+    }
+    to_direction_[0] += g.x, to_direction_[1] += g.y, to_direction_[2] += g.z;
   }
   for (int k = 0; k < 3; ++k) {
     vfloat origin = where(rays_.usable, to_origin_[k]), direction = where(rays_.usable, to_direction_[k]);

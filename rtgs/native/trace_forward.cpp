@@ -284,7 +284,7 @@ inline void PacketTracer::write_channels() {
 
 inline void PacketTracer::write_colors() {
   vfloat basis[16], raw[3], sums[3] = {broadcast(0.f), broadcast(0.f), broadcast(0.f)};
-  packet_basis(args_.surfels.degree, rays_.unit_direction(), basis);
+  packet_basis(args_.surfels.degree, rays_.color_direction(args_.options.raw_sh), basis);
   const int rest = rest_count(args_.surfels.degree);
   for (int k = 0; k < met_; ++k) {
     const vfloat w = load(work_.weights.data + int64_t(work_.met_places[k]) * kLanes);

@@ -66,6 +66,11 @@ struct PacketRays {
     usable = exists & finite(ox) & finite(oy) & finite(oz) & finite(dx) & finite(dy) & finite(dz);
     t_max = select(usable, min(t_max, broadcast(kFarAway)), broadcast(-kFarAway));
   }
+  // Where colours are looked up: at the unit direction, or at the direction as it is given.
+  Direction color_direction(bool raw) const {
+    if (raw) return {where(usable, dx), where(usable, dy), where(usable, dz)};
+    return unit_direction();
+  }
   Direction unit_direction() const {
     const vfloat inverse = where(gt(length, broadcast(0.f)), 1.f / max(length, broadcast(1e-37f)));
     return {dx * inverse, dy * inverse, dz * inverse};

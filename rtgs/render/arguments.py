@@ -109,7 +109,8 @@ def check_trace_options(options: TraceOptions, rays: int) -> None:
     rest_count(options.sh_degree)
     if not 0 <= options.transmittance_cutoff < 1:
         raise ValueError(f"transmittance_cutoff={options.transmittance_cutoff} must be in [0, 1); 0 never stops a ray")
-    for name, choices in {"direction_gradient": ("full", "last_sh"), "order": ("auto", "given", "sorted")}.items():
+    legal = {"direction_gradient": ("full", "last_sh"), "sh_direction": ("unit", "raw")}
+    for name, choices in (legal | {"order": ("auto", "given", "sorted")}).items():
         if getattr(options, name) not in choices:
             raise ValueError(f"{name}={getattr(options, name)!r} is not one of {', '.join(choices)}")
     for name in ("t_min", "t_max"):

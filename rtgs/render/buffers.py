@@ -77,6 +77,7 @@ class TraceOptions:
     normal: bool = False
     weight_sum: bool = False
     direction_gradient: Literal["full", "last_sh"] = "full"  # last_sh: as EnvGS's public tracer (methods.md 0 item 6)
+    sh_direction: Literal["unit", "raw"] = "unit"  # raw: at directions as they are given, as EnvGS's public tracer
     order: Literal["auto", "given", "sorted"] = "auto"  # of the rays in the kernel: as given, or by Morton code
 
 

@@ -275,7 +275,9 @@ def hit_colors(surfels: TracedSurfels, rays: Rays, hits: RayHits, options: Trace
     color = 0.5 + SH_C0 * surfels.sh_dc[hits.surfel]
     if surfels.sh_rest is not None and surfels.sh_rest.shape[1]:
         degree = math.isqrt(surfels.sh_rest.shape[1] + 1) - 1
-        basis = sh_basis(torch.nn.functional.normalize(rays.direction, dim=-1, eps=0.0), degree)
+        raw = options.sh_direction == "raw"
+        direction = rays.direction if raw else torch.nn.functional.normalize(rays.direction, dim=-1, eps=0.0)
+        basis = sh_basis(direction, degree)
         seen = basis[:, None].expand(-1, hits.surfel.shape[1], -1)
         if options.direction_gradient == "last_sh":
             last = hits.contributes & (hits.contributes.flip(1).cumsum(1).flip(1) == 1)

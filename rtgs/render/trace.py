@@ -125,7 +125,7 @@ def trace_surfels(
         origins, directions: (R, 3) world. Directions of any length; t is in units of it. R = 0 is legal.
         tree: built or refitted on exactly these means, tangents, scales and opacities; None builds one.
         features: (N, C), 1 <= C <= 32: what to accumulate; None accumulates none.
-        sh_dc, sh_rest: (N, 3) and (N, K, 3), K = 0, 3, 8 or 15: colour, evaluated at the unit ray direction.
+        sh_dc, sh_rest: (N, 3) and (N, K, 3), K = 0, 3, 8 or 15: colour, evaluated at the ray direction, unit unless told.
         options: bounds, cuts, optional outputs, which direction gradient, order of the rays in the kernel.
         probe: (N, 3), any values: its gradient receives the densification signal, the sum over hits of
             dL/dmean * 0.5 * t (methods.md 3.2).
@@ -159,7 +159,8 @@ class _Call:
     def native_tracing(self):
         o = self.options
         last_sh = o.direction_gradient == "last_sh"
-        return core.Tracing(o.transmittance_cutoff, o.alpha_cutoff, o.sh_degree, last_sh, o.order, self.threads)
+        raw_sh = o.sh_direction == "raw"
+        return core.Tracing(o.transmittance_cutoff, o.alpha_cutoff, o.sh_degree, last_sh, raw_sh, o.order, self.threads)
 
     def bound(self, name: Literal["t_min", "t_max"]):
         """(array per ray or None, number that holds without one)."""

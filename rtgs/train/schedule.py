@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from rtgs.train.settings import ReflectionSettings, ScheduleSettings
+from rtgs.train.settings import ReflectionSettings, ScheduleSettings, TransmittanceSettings
 
 
 def check_schedule(schedule: ScheduleSettings) -> None:
@@ -123,6 +123,38 @@ def base_densify_due(plan: ReflectionPlan, settings: ReflectionSettings, step: i
         every = max(settings.propagation.densify_every, plan.base.densify_every)
         return densify_due(replace(plan.base, densify_every=every), step)
     return densify_due(plan.base, step)
+
+
+@dataclass(frozen=True)
+class TransmittancePlan:
+    """When the third stage does what (methods.md 6.2)."""
+
+    start: int  # first step with straight rays
+    own: ScheduleSettings  # of the transmittance set on its own clock, which is 0 at ``start``
+    base: ScheduleSettings  # of the base set in a run with this stage
+
+    def clock(self, step: int) -> int:
+        """Steps since the start of the stage."""
+        return step - self.start
+
+
+def transmittance_plan(settings: TransmittanceSettings, schedule: ScheduleSettings) -> TransmittancePlan:
+    """The third stage's shares as steps of a run of ``schedule.total`` steps."""
+    start = round(settings.start * schedule.total)
+    length = max(schedule.total - start, 1)
+    own = replace(
+        schedule,
+        total=length,
+        sh_from=0,
+        sh_every=settings.sh_every,
+        densify_from=settings.densify_from,
+        densify_until=max(round(settings.densify_until * schedule.total) - start, 0),
+        densify_every=settings.densify_every,
+        opacity_reset_every=settings.opacity_reset_every,
+        means_lr_steps=min(schedule.means_lr_steps, length),
+    )
+    base = replace(schedule, densify_until=min(schedule.densify_until, start)) if settings.freeze_base else schedule
+    return TransmittancePlan(start, own, base)
 
 
 @dataclass(frozen=True)

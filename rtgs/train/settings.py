@@ -9,7 +9,13 @@ from dataclasses import dataclass, field
 
 from rtgs.optics.settings import OpticsSettings
 from rtgs.train.refuse import refuse_bad_numbers, refuse_unless
-from rtgs.train.specular_settings import MaterialSettings, MatteSettings, PropagationSettings, TracedShareSettings
+from rtgs.train.specular_settings import (
+    InterfaceSettings,
+    MaterialSettings,
+    MatteSettings,
+    PropagationSettings,
+    TracedShareSettings,
+)
 
 
 @dataclass(frozen=True)
@@ -65,11 +71,17 @@ class LossSettings:
     specular: float = 0.0  # RT-GS 0.2, from its third stage on
     specular_start: float = 1 / 3  # 20,000 of 60,000
     specular_target: float = 0.9  # K_0: soft, the diffuse colour keeps a tenth
+    # L_d: the first straight ray's hits lie before the back surface (methods.md 5.1; register row 11).
+    transmission_depth: float = 0.0  # RT-GS 0.2
+    transmission_depth_start: float = 2 / 3  # 40,000 of 60,000
+    transmission_depth_form: str = "accum"  # of sum w t; "mean": divided by sum w; "per_hit": each hit by itself
 
     def __post_init__(self) -> None:
         refuse_bad_numbers(self, "method.loss")
         form = self.perceptual_form
         refuse_unless(form in ("lpips", "vgg_l1"), "method.loss.perceptual_form", form, "lpips or vgg_l1")
+        form, forms = self.transmission_depth_form, ("accum", "mean", "per_hit")
+        refuse_unless(form in forms, "method.loss.transmission_depth_form", form, ", ".join(forms))
         refuse_unless(self.perceptual_crop >= 32, "method.loss.perceptual_crop", self.perceptual_crop, "at least 32")
 
 
@@ -204,6 +216,8 @@ class ReflectionSettings:
     transmittance_cutoff: float = 1e-4
     alpha_cutoff: float = 1 / 255
     direction_gradient: str = "full"  # register row 24; "last_sh": what EnvGS's public tracer returns
+    # Register row 23, of every traced colour: at unit directions, or "raw": rays keep the camera ray's length (EnvGS).
+    sh_direction: str = "unit"
     propagation: PropagationSettings = field(default_factory=PropagationSettings)
     traced: TracedShareSettings = field(default_factory=TracedShareSettings)
     matte: MatteSettings = field(default_factory=MatteSettings)
@@ -223,6 +237,79 @@ class ReflectionSettings:
         kind = self.direction_gradient
         legal = kind in ("full", "last_sh")
         refuse_unless(legal, "method.reflection.direction_gradient", kind, "full or last_sh")
+        kind = self.sh_direction
+        refuse_unless(kind in ("unit", "raw"), "method.reflection.sh_direction", kind, "unit or raw")
+
+
+def _transmittance_init() -> InitSettings:
+    return InitSettings(scale=0.5)  # a quarter of the hits of each ray at the start
+
+
+_TRANSMITTANCE_CHOICES = {
+    "first_bounce": ("transmittance", "base", "none"),
+    "first_bounce_end": ("open", "clip"),
+    "second_bounce": ("mesh", "first_bounce", "none"),
+    "compositing": ("over", "sum"),
+    "first_surface": ("mesh", "base"),
+    "normal": ("base", "mesh"),
+    "box": ("object", "scene"),
+    "test_masks": ("silhouette", "given"),
+}
+
+
+@dataclass(frozen=True)
+class TransmittanceSettings:
+    """The third stage: straight rays through transparent objects (methods.md 3.3, 4.4, 6.2, 6.3).
+
+    Of scenes with masks only. Boundaries are shares of the run, intervals are steps of the set's own clock, which
+    begins with the stage. The first choice of each key is this project's, the paper's way is named beside it.
+    """
+
+    enabled: bool = True  # False: the run ends after the second stage
+    start: float = 1 / 3  # share of the run: 20,000 of 60,000
+    first_bounce: str = "transmittance"  # register row 26: what it meets; "base": the base set inside; "none": nothing
+    first_bounce_end: str = "open"  # row 17, the paper relies on L_d; "clip": no hit counts behind the back surface
+    second_bounce: str = "mesh"  # row 27: begins at the mesh's back; "first_bounce": at z_s + Z_1; "none"
+    second_bounce_gradient: bool = True  # row 13: it teaches the base set
+    second_offset: float = 2.0  # row 14: it begins so many voxels behind the back surface
+    compositing: str = "over"  # row 12: C_1 + (1 - A_1) C_2; "sum": C_1 + C_2
+    first_surface: str = "mesh"  # where the object's pixels have their surface; the paper: "base", the rasterised depth
+    normal: str = "base"  # the rasterised normals there (of the interface, if there is one); "mesh": fixed, for tests
+    split: bool = True  # base surfels inside the mesh become the transmittance set; the paper: a random set (False)
+    split_margin: float = 1.0  # voxels outside the mesh that still count as inside
+    box: str = "object"  # row 16, of a random set; "scene": the paper
+    cells: int = 32  # per axis of the box, as the reflection set
+    per_cell: int = 5
+    most_hits: float = 80.0  # of a ray through the random set: its surfels are shrunk until no more are expected
+    freeze_base: bool = True  # row 18: density control and resets of the base set end here; False: EnvGS's windows
+    test_masks: str = "silhouette"  # row 21: of the mesh, needs no mask at test views; "given": the scene's
+    offset: float = 1e-4  # of the first bounce's start, times the extent
+    opaque: float = 1 / 255  # no second bounce where the first leaves less light than this
+    densify_from: int = 500
+    densify_until: float = 2 / 3  # share of the run: 40,000 of 60,000
+    densify_every: int = 500
+    opacity_reset_every: int = 6_000  # 0 = never; only while densifying
+    sh_every: int = 1_000  # one degree more each; a set taken from the base keeps its degrees
+    rebuild_every: int = 100  # steps between new trees
+    transmittance_cutoff: float = 1e-4
+    alpha_cutoff: float = 1 / 255
+    interface: InterfaceSettings = field(default_factory=InterfaceSettings)
+    init: InitSettings = field(default_factory=_transmittance_init)
+    density: DensitySettings = field(default_factory=_reflection_density)
+
+    def __post_init__(self) -> None:
+        refuse_bad_numbers(self, "method.transmittance")
+        for name in ("start", "densify_until"):
+            value = getattr(self, name)
+            refuse_unless(0 <= value <= 1, f"method.transmittance.{name}", value, "between 0 and 1")
+        for name in ("densify_every", "sh_every", "cells", "per_cell", "rebuild_every", "most_hits"):
+            value = getattr(self, name)
+            refuse_unless(value >= 1, f"method.transmittance.{name}", value, "at least 1")
+        every = self.opacity_reset_every
+        refuse_unless(every >= 0, "method.transmittance.opacity_reset_every", every, "at least 0 (0: never)")
+        for name, choices in _TRANSMITTANCE_CHOICES.items():
+            value = getattr(self, name)
+            refuse_unless(value in choices, f"method.transmittance.{name}", value, " or ".join(choices))
 
 
 @dataclass(frozen=True)
@@ -238,4 +325,5 @@ class MethodSettings:
     materials: MaterialSettings = field(default_factory=MaterialSettings)  # these three: methods with a second stage
     optics: OpticsSettings = field(default_factory=OpticsSettings)
     reflection: ReflectionSettings = field(default_factory=ReflectionSettings)
+    transmittance: TransmittanceSettings = field(default_factory=TransmittanceSettings)  # of rtgs
     paper_schedule: ScheduleSettings = field(default_factory=ScheduleSettings)  # preset=paper takes this one

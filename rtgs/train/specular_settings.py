@@ -1,4 +1,4 @@
-"""Numbers of the second stage that stand for themselves: materials, normal propagation, what is traced, matte scenes.
+"""Numbers of the later stages that stand for themselves: materials, propagation, what is traced, matte scenes, interface.
 
 Boundaries are shares of the run (``schedule.total``), intervals are steps: see ``rtgs.train.settings``.
 """
@@ -94,3 +94,31 @@ class MatteSettings:
         refuse_bad_numbers(self, "method.reflection.matte")
         refuse_unless(0 <= self.probation <= 1, "method.reflection.matte.probation", self.probation, "between 0 and 1")
         refuse_unless(self.views >= 1, "method.reflection.matte.views", self.views, "at least 1")
+
+
+@dataclass(frozen=True)
+class InterfaceSettings:
+    """Opaque surfels on the transparent object's mesh: the surface that photos alone do not form (glass.md).
+
+    They are rasterised with the base set, have its materials, and learn with it; rays that have entered the object do
+    not meet them.
+    """
+
+    count: int = 4_500  # surfels; 0 = none, as in the paper
+    opacity: float = 0.95  # initial
+    floor: float = 0.9  # opacities stay at or above it: photometric training erodes glass; no resets here
+    scale: float = 1.0  # times the distance to the neighbours
+    specular: float = 0.9  # initial k_s: L_spec's target
+    normal_loss: float = 0.2  # weight of 1 - n . N of the mesh in the masks: 0.01 does nothing there, 0.05 harms
+    normal_loss_until: float = 1.0  # share of the run; afterwards only reflections move the normals
+
+    def __post_init__(self) -> None:
+        refuse_bad_numbers(self, "method.transmittance.interface")
+        refuse_unless(self.count >= 0, "method.transmittance.interface.count", self.count, "at least 0 (0: none)")
+        for name in ("opacity", "floor", "specular"):
+            value = getattr(self, name)
+            refuse_unless(0 < value < 1, f"method.transmittance.interface.{name}", value, "between 0 and 1")
+        refuse_unless(
+            self.opacity >= self.floor, "method.transmittance.interface.opacity", self.opacity, f"at least {self.floor}"
+        )
+        refuse_unless(self.scale > 0, "method.transmittance.interface.scale", self.scale, "above 0")

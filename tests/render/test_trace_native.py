@@ -310,6 +310,24 @@ def test_last_sh_changes_the_direction_gradient_alone(isa: str):
     assert not none[LABELS.index("by directions")].any()
 
 
+@pytest.mark.parametrize("gradient", ["full", "last_sh"])
+def test_raw_directions_for_colours_are_those_of_the_twin(isa: str, gradient: str):
+    scene = native_trace_scene(300, 400)
+    scene = replace(scene, directions=scene.directions * torch.linspace(0.7, 1.4, 400)[:, None])
+    case = TraceScene(scene, all_outputs(sh_direction="raw", direction_gradient=gradient))
+    twin = answer(case)
+    found = run_trace(trace_surfels, case, torch.float32, twin.upstream)
+    colors = twin.exact.outputs["colors"]
+    assert (found.outputs["colors"] - colors)[~twin.flagged].abs().max() <= 1e-5 * colors.abs().max()
+    for name, exact in twin.exact.gradients.items():
+        assert (found.gradients[name] - exact).abs().max() <= 1e-4 * exact.abs().max(), name
+    unit = everything(scene, direction_gradient=gradient)
+    raw = everything(scene, direction_gradient=gradient, sh_direction="raw")
+    same = {name for name, a, b in zip(LABELS, unit, raw, strict=True) if torch.equal(a, b)}
+    assert "alpha" in same
+    assert not {"colors", "by sh_rest", "by directions"} & same
+
+
 @pytest.mark.parametrize(("stored", "asked"), [(0, 3), (3, 3), (8, 3), (15, 0), (15, 1), (15, 2)])
 def test_degrees_of_sh(isa: str, stored: int, asked: int):
     scene = native_trace_scene(200, 300)
