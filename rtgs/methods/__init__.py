@@ -21,6 +21,7 @@ from rtgs.methods.stages import stage_settings
 from rtgs.train.settings import MethodSettings, ScheduleSettings
 
 if TYPE_CHECKING:
+    from rtgs.mesh.container import ObjectMesh
     from rtgs.methods.surfel_base import SurfelMethod
     from rtgs.scenes.scene import Scene
 
@@ -28,25 +29,51 @@ METHOD_NAMES = ("2dgs", "3dgs", "envgs", "rtgs")
 
 
 def create_method(
-    settings: MethodSettings, scene: Scene, schedule: ScheduleSettings, generator: torch.Generator
+    settings: MethodSettings,
+    scene: Scene,
+    schedule: ScheduleSettings,
+    generator: torch.Generator,
+    object_mesh: ObjectMesh | None = None,
 ) -> Method:
     """The method ``settings.name``, its surfels initialised from the scene's points.
 
     ``schedule`` decides when losses and density control are on; ``generator`` is drawn from at initialisation and by
-    density control, and its state travels in checkpoints.
+    density control, and its state travels in checkpoints. ``object_mesh``: of the scene's transparent object, for the
+    third stage of methods that have one.
 
     Raises:
-        ValueError: no method has this name.
+        ValueError: no method has this name, or it cannot use a mesh.
     """
-    return _method_class(settings)(settings, scene, schedule, generator)
+    kind = _method_class(settings)
+    if object_mesh is None:
+        return kind(settings, scene, schedule, generator)
+    if not has_third_stage(settings):
+        raise ValueError(f"method {settings.name} has no stage that takes an object mesh; method=rtgs has")
+    from rtgs.methods.transmittance import TransmissiveMethod
+
+    assert issubclass(kind, TransmissiveMethod)
+    return kind(settings, scene, schedule, generator, object_mesh)
 
 
-def method_stages(settings: MethodSettings, schedule: ScheduleSettings) -> tuple[Stage, ...]:
+def has_third_stage(settings: MethodSettings) -> bool:
+    """Whether the method ``settings.name`` has a stage for transparent objects, and it is switched on."""
+    return settings.name == "rtgs" and settings.transmittance.enabled
+
+
+def method_stages(
+    settings: MethodSettings, schedule: ScheduleSettings, *, transparent: bool = False
+) -> tuple[Stage, ...]:
     """The stages that the method ``settings.name`` goes through under ``schedule``, in order.
 
+    ``transparent``: the scene has a transparent object (masks that are not empty).
+
     Raises:
-        ValueError: no method has this name.
+        ValueError: no method has this name, or the stages are out of order.
     """
+    if transparent and has_third_stage(settings):
+        from rtgs.methods.transmittance import TransmissiveMethod
+
+        return TransmissiveMethod.declare_stages(settings, schedule, transparent=True)
     return _method_class(settings).declare_stages(settings, schedule)
 
 
@@ -82,6 +109,7 @@ __all__ = [
     "Stage",
     "StepEvent",
     "create_method",
+    "has_third_stage",
     "method_stages",
     "stage_settings",
 ]

@@ -41,12 +41,13 @@ class RenderOptions:
     median_depth: bool = False
     normal: bool = False
     distortion: bool = False
-    layers: bool = False  # what reflection adds, of methods that have it
+    layers: bool = False  # what reflection and transmission add, of methods that have them
+    masks: str = ""  # which pixels show a transparent object: "given", "silhouette"; "": as the settings say
 
 
 @dataclass(frozen=True)
 class SpecularLayers:
-    """What a view with reflection is made of: image = diffuse part (1 - k_s) C_d + reflection."""
+    """What a view with reflection is made of: image = diffuse part (1 - k_s) C_d + reflection + transmission."""
 
     diffuse: Tensor  # (3, H, W) C_d
     reflection: Tensor  # (3, H, W) k_s w_r C_r; 0 where no ray was traced
@@ -55,6 +56,21 @@ class SpecularLayers:
     roughness: Tensor  # (H, W) in 0..1
     f0: Tensor  # (H, W), or (3, H, W) for rgb
     traced: Tensor  # (H, W) bool
+    transmission: Tensor | None = None  # (3, H, W) k_s w_t C_t; 0 outside transparent objects; None: no third stage
+    transmitted_color: Tensor | None = None  # (3, H, W) C_t
+
+
+@dataclass(frozen=True)
+class FirstBounce:
+    """What the first straight rays met, for the loss on their depth (methods.md 5.1); R rays that have a back surface.
+
+    Depths count from the first surface, in z-depth units.
+    """
+
+    depth: Tensor  # (R,) Z_1 = sum of w t, with its graph
+    alpha: Tensor  # (R,) A_1, with its graph
+    thickness: Tensor  # (R,) z_2 - z_s, no graph
+    beyond: Tensor | None = None  # (R,) sum of w (t - thickness) over the hits behind the back surface, if asked for
 
 
 @dataclass(frozen=True)
@@ -66,6 +82,8 @@ class RenderedView:
     buffers: RasterBuffers  # of the base set; maps that were not asked for are None
     layers: SpecularLayers | None = None  # of methods with reflection, when asked for
     specular: Tensor | None = None  # (H, W) k_s as composited, with its graph
+    first_bounce: FirstBounce | None = None  # of the third stage, in training
+    transparent: Tensor | None = None  # (H, W) bool: pixels that got straight rays; None: no third stage
 
 
 @dataclass(frozen=True)
@@ -121,8 +139,13 @@ class Method(Protocol):
         """Called once when a stage starts afresh (not when it goes on from a checkpoint of its own)."""
         ...
 
-    def render(self, camera: Camera, step: int, options: RenderOptions | None = None) -> RenderedView:
-        """Render one view as of ``step``. ``options=None``: the outputs that the losses of this step need."""
+    def render(
+        self, camera: Camera, step: int, options: RenderOptions | None = None, mask: Tensor | None = None
+    ) -> RenderedView:
+        """Render one view as of ``step``. ``options=None``: the outputs that the losses of this step need.
+
+        ``mask`` (H, W) bool, the view's own of its transparent objects: for methods with a third stage.
+        """
         ...
 
     def losses(self, rendered: RenderedView, view: View, step: int) -> LossTerms:

@@ -35,7 +35,7 @@ class MirrorRays:
     """P rays that leave the surface at the mirror direction."""
 
     origins: Tensor  # (P, 3) world
-    directions: Tensor  # (P, 3) unit
+    directions: Tensor  # (P, 3) unit, unless asked for otherwise
     cosine: Tensor  # (P,) n . omega_o
 
 
@@ -57,12 +57,16 @@ def surface_pixels(
     return SurfacePixels(diffuse, specular, roughness, f0, normal, depth)
 
 
-def mirror_rays(pixels: SurfacePixels, center: Tensor, view: Tensor) -> MirrorRays:
-    """Reflect the pixels' rays (3, P), camera-z component 1, from the camera at ``center`` (3,) world."""
+def mirror_rays(pixels: SurfacePixels, center: Tensor, view: Tensor, length: str = "unit") -> MirrorRays:
+    """Reflect the pixels' rays (3, P), camera-z component 1, from the camera at ``center`` (3,) world.
+
+    ``length`` of the mirror rays: "unit", or "raw": as long as the ray they come from (register row 23).
+    """
     outward = -view / view.norm(dim=0)  # omega_o
     normal = pixels.normal * pixels.normal.square().sum(0).clamp_min(SHORTEST_NORMAL**2).rsqrt()
     cosine = (normal * outward).sum(0)
     directions = 2 * cosine * normal - outward
+    directions = directions * view.norm(dim=0) if length == "raw" else directions
     origins = center[:, None] + pixels.depth * view
     return MirrorRays(origins.T.contiguous(), directions.T.contiguous(), cosine)
 
@@ -75,13 +79,14 @@ def pixel_weights(cosine: Tensor, pixels: SurfacePixels, optics: OpticsSettings)
     return SpecularWeights(weights.reflection.T, weights.transmission.T, weights.fresnel.T)
 
 
-def specular_change(pixels: SurfacePixels, weight: Tensor, traced: Tensor, emphasis: Tensor | None) -> Tensor:
-    """(3, P) what reflection adds to C_d: k_s (w_r C_r - C_d), so that C_d plus it is (1 - k_s) C_d + k_s w_r C_r.
+def specular_change(pixels: SurfacePixels, light: Tensor, emphasis: Tensor | None) -> Tensor:
+    """(3, P) what traced light adds to C_d: k_s (light - C_d), so that C_d plus it is (1 - k_s) C_d + k_s light.
 
+    ``light`` (3, P): w_r C_r, and w_t C_t where the pixel shows a transparent object.
     ``emphasis`` (P,) multiplies the gradient and leaves the value alone: 1 / share for pixels drawn with that share
     makes the gradient of every parameter right on average (docs/reflection.md).
     """
-    change = pixels.specular * (weight * traced - pixels.diffuse)
+    change = pixels.specular * (light - pixels.diffuse)
     return change if emphasis is None else _Emphasize.apply(change, emphasis)  # type: ignore[return-value]
 
 

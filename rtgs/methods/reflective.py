@@ -21,6 +21,7 @@ from rtgs.methods.base import (
     Stage,
     StepEvent,
 )
+from rtgs.methods.glass import GlassPixels, GlassRays, Transmission, glass_rays
 from rtgs.methods.matte import MatteEvidence, gather_evidence
 from rtgs.methods.mirror import (
     SHORTEST_NORMAL,
@@ -66,7 +67,7 @@ class ReflectiveMethod(SurfelMethod):
         self, settings: MethodSettings, scene: Scene, schedule: ScheduleSettings, generator: torch.Generator
     ) -> None:
         super().__init__(settings, scene, schedule, generator)
-        self.plan = reflection_plan(settings.reflection, schedule)
+        self.plan = reflection_plan(settings.reflection, self.base_schedule)
         self.reflection: ReflectionSet | None = None
         self._matte: MatteEvidence | None = None
         self.perceptual = self._find_perceptual()
@@ -88,8 +89,9 @@ class ReflectiveMethod(SurfelMethod):
 
     def begin(self, stage: Stage) -> tuple[StepEvent, ...]:
         """The reflection stage: materials on the base set, the reflection set in its box."""
-        if stage.name != "reflection":
-            return ()
+        return self._add_reflection() if stage.name == "reflection" else ()
+
+    def _add_reflection(self) -> tuple[StepEvent, ...]:
         self.base.adopt(with_materials(self.base.surfels, self.settings.materials))  # type: ignore[arg-type]
         self.reflection = self._new_set(reflection_surfels(self.settings.reflection, self._points, self.generator))
         return (StepEvent("begin", "reflection", f"{len(self.reflection)} surfels in the box"),)
@@ -135,20 +137,38 @@ class ReflectiveMethod(SurfelMethod):
         if self.reflection is None:
             return colors
         assert isinstance(self.base.surfels, MaterialSurfels)
-        materials = activate_materials(self.base.surfels, self.settings.materials)
+        return self.material_features(self.base.surfels, colors)
+
+    def material_features(self, surfels: MaterialSurfels, colors: Tensor) -> Tensor:
+        """(N, 5 + F) what is composited of surfels with materials: colours, k_s, roughness, f0."""
+        materials = activate_materials(surfels, self.settings.materials)
         return torch.cat((colors, materials.specular[:, None], materials.roughness[:, None], materials.f0), dim=1)
 
-    def render(self, camera: Camera, step: int, options: RenderOptions | None = None) -> RenderedView:
+    def see_through(
+        self, camera: Camera, flat: SurfacePixels, mask: Tensor | None, options: RenderOptions | None
+    ) -> GlassPixels | None:
+        """Where this view looks through a transparent object; None: nowhere, or no stage for it."""
+        return None
+
+    def transmit(self, glass: GlassPixels, rays: GlassRays, step: int, options: RenderOptions | None) -> Transmission:
+        """What straight rays through the object meet; called where :meth:`see_through` found some."""
+        raise RuntimeError(f"method {self.settings.name} has no stage for transparent objects")
+
+    def render(
+        self, camera: Camera, step: int, options: RenderOptions | None = None, mask: Tensor | None = None
+    ) -> RenderedView:
         """Render one view; in training only some pixels may be traced, and the image of the others is C_d."""
         if self.reflection is None:
             return super().render(camera, step, options)
         buffers = self.rasterize_base(camera, step, None if options is None else self._with_surface(options))
         flat = self._flat_pixels(buffers)
+        glass = self.see_through(camera, flat, mask, options)
+        flat = flat if glass is None else glass.flat
         rays = camera.rays()
         view = rays.directions.reshape(-1, 3).T
-        chosen = self._choose(flat, buffers, view, training=options is None)
+        chosen = self._choose(flat, buffers, view, glass, training=options is None)
         pixels = _take(flat, chosen.index)
-        mirrored = mirror_rays(pixels, rays.origin, view[:, chosen.index])
+        mirrored = mirror_rays(pixels, rays.origin, view[:, chosen.index], self.settings.reflection.sh_direction)
         ahead = self.reflection.density.needs_signal and densify_ahead(self.plan.reflection, step)
         watched = options is None and ahead
         traced = self.reflection.trace(
@@ -156,15 +176,26 @@ class ReflectiveMethod(SurfelMethod):
         )
         assert traced.colors is not None
         color = traced.colors.T
-        weight = pixel_weights(mirrored.cosine, pixels, self.settings.optics).reflection
-        change = specular_change(pixels, weight, color, chosen.emphasis)
+        weights = pixel_weights(mirrored.cosine, pixels, self.settings.optics)
+        light, passed = weights.reflection * color, None
+        if glass is not None:
+            passed = self.transmit(glass, glass_rays(glass, chosen.index, rays.origin, view), step, options)
+            light = light + weights.transmission * passed.color
+        change = specular_change(pixels, light, chosen.emphasis)
         shape = (3, camera.height, camera.width)
         image = flat.diffuse.index_add(1, chosen.index, change).reshape(shape)
         specular = flat.specular.reshape(shape[1:])
         layers = None
         if options is not None and options.layers:
-            layers = _layers(flat, chosen, pixels.specular * weight * color, color, shape)
-        return RenderedView(camera, image, buffers, layers, specular)
+            layers = _layers(flat, chosen, pixels.specular * weights.reflection * color, color, shape)
+        if glass is None or passed is None:
+            return RenderedView(camera, image, buffers, layers, specular)
+        if layers is not None:
+            through = pixels.specular * weights.transmission * passed.color
+            both = (_full(values.detach(), chosen, shape) for values in (through, passed.color))
+            layers = replace(layers, **dict(zip(("transmission", "transmitted_color"), both, strict=True)))
+        inside = glass.inside.reshape(shape[1:])
+        return RenderedView(camera, image, buffers, layers, specular, passed.first_bounce, inside)
 
     def _flat_pixels(self, buffers: RasterBuffers) -> SurfacePixels:
         """Every pixel of the view, flattened."""
@@ -180,7 +211,9 @@ class ReflectiveMethod(SurfelMethod):
         )
 
     @torch.no_grad()
-    def _choose(self, flat: SurfacePixels, buffers: RasterBuffers, view: Tensor, *, training: bool) -> TracedPixels:
+    def _choose(
+        self, flat: SurfacePixels, buffers: RasterBuffers, view: Tensor, glass: GlassPixels | None, *, training: bool
+    ) -> TracedPixels:
         settings = self.settings.reflection
         surface = (buffers.alpha.flatten() > settings.smallest_alpha) & (flat.depth > 0)
         surface &= flat.normal.square().sum(0) > SHORTEST_NORMAL**2
@@ -190,7 +223,10 @@ class ReflectiveMethod(SurfelMethod):
             cosine = -(unit * view).sum(0) / view.norm(dim=0)
             weight = pixel_weights(cosine, flat, self.settings.optics).reflection
             weight = weight if weight.ndim == 1 else weight.amax(0)
-            showing = (flat.specular * weight.clamp_min(1)).reshape(buffers.alpha.shape)
+            showing = flat.specular * weight.clamp_min(1)
+            showing = (showing if glass is None else showing.masked_fill(glass.inside, torch.inf)).reshape(
+                buffers.alpha.shape
+            )
         generator = self.generator if training else None
         return choose_pixels(surface.reshape(buffers.alpha.shape), showing, settings.traced, generator)
 
@@ -204,6 +240,7 @@ class ReflectiveMethod(SurfelMethod):
             sh_degree=self._reflection_degree(step),
             weight_sum=watched,
             direction_gradient=settings.direction_gradient,  # type: ignore[arg-type]
+            sh_direction=settings.sh_direction,  # type: ignore[arg-type]
         )
 
     def _reflection_degree(self, step: int) -> int:
@@ -235,7 +272,7 @@ class ReflectiveMethod(SurfelMethod):
         """Opacity resets of both sets, k_s resets, normal propagation."""
         settings = self.settings
         events = []
-        if self.base.density.resets_opacity and opacity_reset_due(self.schedule, following):
+        if self.base.density.resets_opacity and opacity_reset_due(self.plan.base, following):
             events.append(self.reset_opacity(self.base, settings.density.reset_opacity))
             if self.reflection is not None and settings.reflection.specular_reset:
                 reset_specular(self.base, settings.materials.specular)
@@ -282,7 +319,8 @@ class ReflectiveMethod(SurfelMethod):
         if self.perceptual is not None and step >= loss_start(loss.perceptual_start, total):
             value = self.perceptual(rendered.image, view.image, self.generator)
             found = found.plus("perceptual", value, loss.perceptual)
-        if loss.specular > 0 and view.mask is not None and step >= loss_start(loss.specular_start, total):
+        wanted = loss.specular > 0 and self.settings.transmittance.enabled
+        if wanted and view.mask is not None and step >= loss_start(loss.specular_start, total):
             value = (view.mask * (loss.specular_target - rendered.specular).clamp_min(0)).mean()
             found = found.plus("specular", value, loss.specular)
         return found
@@ -309,6 +347,11 @@ class ReflectiveMethod(SurfelMethod):
             self._tell_matte(MatteEvidence.of(state["matte"]))
 
 
+def _full(values: Tensor, chosen: TracedPixels, shape) -> Tensor:
+    """(3, P) values of the traced pixels as a picture, 0 elsewhere."""
+    return torch.zeros(3, shape[1] * shape[2]).index_copy(1, chosen.index, values).reshape(shape)
+
+
 def _take(pixels: SurfacePixels, index: Tensor) -> SurfacePixels:
     """The pixels of an index (P,)."""
     rows = (getattr(pixels, name) for name in ("diffuse", "specular", "roughness", "f0", "normal", "depth"))
@@ -317,16 +360,12 @@ def _take(pixels: SurfacePixels, index: Tensor) -> SurfacePixels:
 
 def _layers(flat: SurfacePixels, chosen: TracedPixels, reflection: Tensor, color: Tensor, shape) -> SpecularLayers:
     """The maps of a view from what was traced."""
-
-    def full(values: Tensor) -> Tensor:
-        return torch.zeros(3, shape[1] * shape[2]).index_copy(1, chosen.index, values).reshape(shape)
-
     traced = torch.zeros(shape[1] * shape[2], dtype=torch.bool)
     traced[chosen.index] = True
     return SpecularLayers(
         diffuse=flat.diffuse.reshape(shape),
-        reflection=full(reflection.detach()),
-        reflected_color=full(color.detach()),
+        reflection=_full(reflection.detach(), chosen, shape),
+        reflected_color=_full(color.detach(), chosen, shape),
         specular=flat.specular.reshape(shape[1:]),
         roughness=flat.roughness.reshape(shape[1:]),
         f0=flat.f0.reshape(*flat.f0.shape[:-1], *shape[1:]),

@@ -1,9 +1,9 @@
-"""RT-GS to its second stage: the diffuse base set, then reflection with the microfacet weight (methods.md 6.2)."""
+"""RT-GS: the diffuse base set, then reflection with the microfacet weight, then transmittance (methods.md 6.2)."""
 
 from __future__ import annotations
 
-from rtgs.methods.reflective import ReflectiveMethod
+from rtgs.methods.transmittance import TransmissiveMethod
 
 
-class RtGs(ReflectiveMethod):
-    """RT-GS up to the point where transmittance starts; its numbers are in conf/method/rtgs."""
+class RtGs(TransmissiveMethod):
+    """RT-GS; its numbers are in conf/method/rtgs."""

@@ -12,7 +12,7 @@ from rtgs.cameras import Camera
 from rtgs.errors import RtgsError
 from rtgs.gaussians.initialize import gaussians_from_points
 from rtgs.gaussians.primitives import Gaussians
-from rtgs.gaussians.surfels import Surfels
+from rtgs.gaussians.surfels import ActivatedSurfels, Surfels
 from rtgs.methods.base import Decision, LossTerm, LossTerms, RenderedView, RenderOptions, Stage, StepEvent
 from rtgs.methods.surfel_set import SurfelSet
 from rtgs.render.buffers import RasterBuffers, RasterOptions
@@ -68,6 +68,7 @@ class SurfelMethod:
         check_schedule(schedule)
         self.settings = settings
         self.schedule = schedule
+        self.base_schedule = schedule  # of the base set's density control: a later stage may end it early
         self.generator = generator
         self.extent = scene.extent
         self.mcmc = settings.density.mcmc if settings.density.strategy == "mcmc" else None
@@ -115,7 +116,9 @@ class SurfelMethod:
             distortion=_on(self.starts.distortion, step),
         )
 
-    def render(self, camera: Camera, step: int, options: RenderOptions | None = None) -> RenderedView:
+    def render(
+        self, camera: Camera, step: int, options: RenderOptions | None = None, mask: Tensor | None = None
+    ) -> RenderedView:
         """Render one view; with ``options=None`` (training) density control watches it while it will run again."""
         buffers = self.rasterize_base(camera, step, options)
         return RenderedView(camera, buffers.features, buffers)
@@ -126,7 +129,8 @@ class SurfelMethod:
         wanted = self.training_options(step) if options is None else options
         surfels = self.base.activated(camera.center.float(), self.sh_degree(step))
         probe = self.base.new_probe() if watched else None
-        features = self.base_features(surfels.colors)
+        surfels, features = self.rasterized(surfels, self.base_features(surfels.colors), camera, step)
+        extra = len(surfels.means) - len(self.base)  # rows that density control does not watch
         buffers = rasterize_surfels(
             surfels.means,
             surfels.tangent_u,
@@ -137,15 +141,21 @@ class SurfelMethod:
             camera,
             background=torch.nn.functional.pad(self._background, (0, features.shape[1] - 3)),
             options=self.raster_options(wanted, weight_sum=watched),
-            screen_probe=probe,
+            screen_probe=probe if probe is None or extra == 0 else torch.nn.functional.pad(probe, (0, 0, 0, extra)),
         )
         if probe is not None and buffers.weight_sum is not None:
-            self.base.watch(probe, buffers.weight_sum)
+            self.base.watch(probe, buffers.weight_sum[: len(self.base)])
         return buffers
+
+    def rasterized(
+        self, surfels: ActivatedSurfels, features: Tensor, camera: Camera, step: int
+    ) -> tuple[ActivatedSurfels, Tensor]:
+        """What is rasterised: the base set with its features (N, C), and what a subclass appends to them."""
+        return surfels, features
 
     def watched(self, step: int, options: RenderOptions | None) -> bool:
         """Whether density control learns from a view rendered with these options at this step."""
-        return options is None and self.base.density.needs_signal and densify_ahead(self.schedule, step)
+        return options is None and self.base.density.needs_signal and densify_ahead(self.base_schedule, step)
 
     def base_features(self, colors: Tensor) -> Tensor:
         """(N, C) what is composited of the base set: the SH colours (N, 3) first."""
@@ -224,9 +234,9 @@ class SurfelMethod:
         self.base.perturb(step, self.generator)
         following = step + 1
         events = []
-        if densify_due(self.schedule, following):
+        if densify_due(self.base_schedule, following):
             events.append(self.densify(self.base, self.settings.density.min_opacity, following))
-        if self.base.density.resets_opacity and opacity_reset_due(self.schedule, following):
+        if self.base.density.resets_opacity and opacity_reset_due(self.base_schedule, following):
             events.append(self.reset_opacity(self.base, self.settings.density.reset_opacity))
         return tuple(events)
 

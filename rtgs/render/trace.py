@@ -125,8 +125,8 @@ def trace_surfels(
         origins, directions: (R, 3) world. Directions of any length; t is in units of it. R = 0 is legal.
         tree: built or refitted on exactly these means, tangents, scales and opacities; None builds one.
         features: (N, C), 1 <= C <= 32: what to accumulate; None accumulates none.
-        sh_dc, sh_rest: (N, 3) and (N, K, 3), K = 0, 3, 8 or 15: colour, evaluated at the ray direction, unit unless told.
-        options: bounds, cuts, optional outputs, which direction gradient, order of the rays in the kernel.
+        sh_dc, sh_rest: (N, 3) and (N, K, 3), K = 0, 3, 8 or 15: colour, evaluated at the unit ray direction.
+        options: bounds, cuts, optional outputs, which directions and gradients, order of the rays in the kernel.
         probe: (N, 3), any values: its gradient receives the densification signal, the sum over hits of
             dL/dmean * 0.5 * t (methods.md 3.2).
 

@@ -1,4 +1,4 @@
-"""Numbers of the later stages that stand for themselves: materials, propagation, what is traced, matte scenes, interface.
+"""Numbers of the later stages that stand for themselves: materials, propagation, what is traced, interface.
 
 Boundaries are shares of the run (``schedule.total``), intervals are steps: see ``rtgs.train.settings``.
 """

@@ -155,7 +155,7 @@ class Trainer:
         """Mean PSNR over the test views at the present step, images clamped to [0, 1]."""
         with torch.no_grad():
             values = [
-                _psnr(self.method.render(view.camera, self._step, RenderOptions()).image, view.image)
+                _psnr(self.method.render(view.camera, self._step, RenderOptions(), view.mask).image, view.image)
                 for view in self.scene.test
             ]
         return sum(values) / len(values)
@@ -172,7 +172,7 @@ class Trainer:
         """Render, loss, backward, Adam, density control: one step on one view."""
         step = self._step
         view = self.scene.train[self._order.next()]
-        rendered = self.method.render(view.camera, step)
+        rendered = self.method.render(view.camera, step, None, view.mask)
         terms = self.method.losses(rendered, view, step)
         loss = check_loss(terms, self.method, step, view.name)
         terms.total.backward()

@@ -73,7 +73,7 @@ def twin_render(method: ReflectiveMethod, base, reflection, camera) -> TwinRende
     )
     assert traced.colors is not None
     weight = pixel_weights(mirrored.cosine, flat, settings.optics).reflection
-    change = torch.where(covered, specular_change(flat, weight, traced.colors.T, None), 0.0)
+    change = torch.where(covered, specular_change(flat, weight * traced.colors.T, None), 0.0)
     image = (flat.diffuse + change).reshape(3, camera.height, camera.width)
     fragile = discontinuity_mask(*shape, features, camera, options=options).flatten()
     fragile |= fragile_rays(*traced_shape, mirrored.origins, mirrored.directions, **colors, options=trace)

@@ -1,0 +1,91 @@
+"""The pixels of a view that show a transparent object, and the straight rays through them (methods.md 3.3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from rtgs.mesh.container import ObjectSurfaces
+from rtgs.methods.base import FirstBounce
+from rtgs.methods.mirror import SurfacePixels
+
+
+@dataclass(frozen=True)
+class GlassPixels:
+    """All H * W pixels of a view, flattened, with what is known of the object in them."""
+
+    flat: SurfacePixels  # first surface and normal as the settings want them
+    inside: Tensor  # (H * W,) bool: the pixel shows the object and gets straight rays
+    far: Tensor  # (H * W,) z-depth of the second surface, no graph; the first where there is none
+    second: Tensor  # (H * W,) bool: a second surface was found
+
+
+@dataclass(frozen=True)
+class GlassRays:
+    """R straight rays from the first surface on, no graph: along a ray its start changes no colour."""
+
+    rows: Tensor  # (R,) int64 into the traced pixels
+    count: int  # of traced pixels
+    center: Tensor  # (3,) camera centre
+    directions: Tensor  # (R, 3) camera-z component 1
+    near: Tensor  # (R,) z-depth of the first surface
+    far: Tensor  # (R,) of the second; ``near`` where there is none
+    second: Tensor  # (R,) bool
+
+    def at(self, depth: Tensor, rows: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Origins at these z-depths and directions, of all rays or of some."""
+        directions = self.directions if rows is None else self.directions[rows]
+        return self.center + depth[:, None] * directions, directions
+
+
+@dataclass(frozen=True)
+class Transmission:
+    """What the straight rays met."""
+
+    color: Tensor  # (3, P) C_t of the traced pixels; 0 outside the object
+    first_bounce: FirstBounce | None  # in training, for rays with a second surface
+
+
+def glass_pixels(
+    flat: SurfacePixels, surfaces: ObjectSurfaces, inside: Tensor, *, first_surface: str, normal: str
+) -> GlassPixels:
+    """Put the mesh's surface where it is known: ``first_surface`` and ``normal`` are "mesh" or "base".
+
+    Args:
+        flat: the rasterised surface of all H * W pixels.
+        surfaces: of the object's mesh.
+        inside: (H, W) bool: pixels that show the object.
+    """
+    inside, hit = inside.flatten(), surfaces.hit.flatten()
+    known = inside & hit
+    if first_surface == "mesh":
+        flat = replace(flat, depth=torch.where(known, surfaces.near.flatten(), flat.depth))
+    if normal == "mesh":
+        flat = replace(flat, normal=torch.where(known, surfaces.normal.flatten(1), flat.normal))
+    near, second = flat.depth.detach(), surfaces.second.flatten() & known
+    # A mesh away from the rasterised surface must not put the back before the front.
+    far = torch.where(second, torch.maximum(surfaces.far.flatten(), near), near)
+    return GlassPixels(flat, inside, far, second)
+
+
+def glass_rays(glass: GlassPixels, index: Tensor, center: Tensor, view: Tensor) -> GlassRays:
+    """The straight rays of the traced pixels ``index`` (P,) that show the object; ``view`` (3, H * W) world rays."""
+    rows = glass.inside[index].nonzero()[:, 0]
+    pixels = index[rows]
+    near = glass.flat.depth.detach()[pixels]
+    directions = view[:, pixels].T.contiguous()
+    return GlassRays(rows, len(index), center, directions, near, glass.far[pixels], glass.second[pixels])
+
+
+def depth_loss(bounce: FirstBounce, form: str, pixels: int) -> Tensor:
+    """L_d: the first straight ray's hits lie before the second surface, summed over rays / ``pixels`` (methods.md 5.1).
+
+    ``form``: "accum" ReLU(Z_1 - thickness), "mean" with Z_1 / A_1 instead, "per_hit" sum of w ReLU(t - thickness).
+    """
+    if form == "per_hit":
+        assert bounce.beyond is not None
+        return bounce.beyond.clamp_min(0).sum() / pixels
+    depth = bounce.depth / bounce.alpha.clamp_min(1e-3) if form == "mean" else bounce.depth
+    return (depth - bounce.thickness).clamp_min(0).sum() / pixels

@@ -1,0 +1,57 @@
+"""The interface: opaque surfels with materials on the transparent object's mesh (glass.md, "Design to try first")."""
+
+from __future__ import annotations
+
+import torch
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from rtgs.gaussians.density import logit
+from rtgs.gaussians.harmonics import rest_count
+from rtgs.gaussians.initialize import neighbor_distance
+from rtgs.gaussians.materials import MaterialSurfels, with_materials
+from rtgs.gaussians.surfels import Surfels
+from rtgs.mesh.container import ObjectMesh
+from rtgs.methods.surfel_set import SurfelSet
+from rtgs.train.settings import MethodSettings
+
+
+class InterfaceSet(SurfelSet):
+    """A set without density control whose opacities stay at or above ``floor``."""
+
+    floor: float = 0.9
+
+    @torch.no_grad()
+    def _clamp(self) -> None:
+        super()._clamp()
+        self.surfels.opacity_logits.clamp_(min=logit(self.floor))
+
+
+def normal_quaternions(normals: Tensor) -> Tensor:
+    """(N, 4) w, x, y, z of rotations whose third column is the unit normal (N, 3); the shortest ones from +z."""
+    x, y, z = normals.unbind(1)
+    turned = torch.stack((1 + z, -y, x, torch.zeros_like(x)), dim=1)
+    half_turn = torch.tensor([0.0, 1.0, 0.0, 0.0]).to(normals)  # -z: any axis in the plane
+    return torch.where((z < -1 + 1e-6)[:, None], half_turn, turned)
+
+
+def interface_surfels(
+    settings: MethodSettings, mesh: ObjectMesh, colors_of: Surfels, generator: torch.Generator
+) -> MaterialSurfels:
+    """Surfels spread over the mesh, with its normals, the colour of the nearest of ``colors_of``, and the initial
+    materials but for k_s."""
+    own = settings.transmittance.interface
+    points, normals = mesh.sample(own.count, generator)
+    _, nearest = KDTree(colors_of.means.detach().double().numpy()).query(points.double().numpy())
+    spacing = own.scale * neighbor_distance(points, settings.init.neighbors)
+    plain = Surfels(
+        means=points,
+        log_scales=spacing.log()[:, None].repeat(1, 2),
+        quaternions=normal_quaternions(normals),
+        opacity_logits=torch.full((len(points),), logit(own.opacity)),
+        sh_dc=colors_of.sh_dc.detach()[torch.from_numpy(nearest)].clone(),
+        sh_rest=torch.zeros(len(points), rest_count(settings.init.sh_degree), 3),
+    )
+    made = with_materials(plain, settings.materials)
+    made.specular_logits = torch.full((len(points),), logit(own.specular))
+    return made

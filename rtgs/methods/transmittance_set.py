@@ -1,0 +1,62 @@
+"""Where the transmittance set comes from: base surfels inside the object, or random ones in a box (methods.md 6.2)."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from rtgs.gaussians.density import RowPlan, apply_plan, select_rows
+from rtgs.gaussians.initialize import points_box
+from rtgs.gaussians.materials import MaterialSurfels, without_materials
+from rtgs.gaussians.surfels import Surfels
+from rtgs.mesh.container import ObjectMesh
+from rtgs.methods.surfel_set import SurfelSet
+from rtgs.methods.traced_set import stratified_surfels
+from rtgs.train.settings import TransmittanceSettings
+
+
+def rows_inside(surfels: Surfels, mesh: ObjectMesh, margin: float) -> Tensor:
+    """(N,) bool: the centre lies in the object, or within ``margin`` (world units) of it along an axis."""
+    means = surfels.means.detach()
+    inside = mesh.inside(means)
+    if margin > 0 and not mesh.flat:
+        for axis in range(3):
+            for side in (-margin, margin):
+                shift = torch.zeros(3)
+                shift[axis] = side
+                inside |= mesh.inside(means + shift)
+    return inside
+
+
+@torch.no_grad()
+def take_out(base: SurfelSet, rows: Tensor) -> Surfels:
+    """Remove the surfels ``rows`` (N,) bool of the base set, with their moments, and return them without materials."""
+    taken = select_rows(base.surfels, rows)
+    nothing = select_rows(base.surfels, torch.zeros(0, dtype=torch.int64))
+    apply_plan(RowPlan((~rows).nonzero()[:, 0], nothing), base.surfels, base.optimizer, base.density)
+    return without_materials(taken) if isinstance(taken, MaterialSurfels) else taken  # type: ignore[return-value]
+
+
+def random_surfels(settings: TransmittanceSettings, box: Tensor, generator: torch.Generator) -> Surfels:
+    """Stratified random surfels in the box (2, 3), small enough that a ray meets ``most_hits`` of them at most.
+
+    A convex box of surface S shows S / 4 on average (Cauchy), a disc half its area: that gives the expected number.
+    """
+    surfels = stratified_surfels(box, settings.cells, settings.per_cell, settings.init, generator)
+    side = (box[1] - box[0]).clamp_min(1e-12)
+    shown = float(side[0] * side[1] + side[1] * side[2] + side[2] * side[0]) / 2
+    visible = max(settings.init.opacity / settings.alpha_cutoff, 1.0 + 1e-6)
+    with torch.no_grad():
+        areas = math.pi * 2 * math.log(visible) * surfels.log_scales.exp().prod(dim=1)
+        hits = float(areas.double().sum()) / 2 / max(shown, 1e-24)
+        if hits > settings.most_hits:
+            surfels.log_scales += 0.5 * math.log(settings.most_hits / hits)
+    return surfels
+
+
+def initial_box(settings: TransmittanceSettings, mesh: ObjectMesh, cameras, points: Tensor) -> Tensor:
+    """(2, 3) where a random set begins: the object's box, or the scene's (register row 16)."""
+    usable = points[torch.isfinite(points).all(dim=1)]
+    return points_box(usable) if settings.box == "scene" else mesh.transmittance_box(cameras, usable)
