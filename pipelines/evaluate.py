@@ -11,6 +11,11 @@ from rtgs.pipeline import StepContext, StepKind
 
 TABLE_JSON = "metrics.json"
 TABLE_CSV = "metrics.csv"
+TRACKED = (  # means over the test views that go to the tracker, where they are measured
+    *("psnr", "ssim", "lpips_01", "psnr_masked", "ssim_masked", "lpips_01_masked", "psnr_specular"),
+    *("psnr_reflection", "psnr_reflection_scaled", "psnr_transmission", "psnr_transmission_scaled"),
+    *("psnr_given_masks", "psnr_masked_given_masks", "ssim_masked_given_masks"),
+)
 
 
 @dataclass(frozen=True)
@@ -55,13 +60,13 @@ def evaluate(params: EvaluateParams, context: StepContext) -> None:
     write_error_maps(renders, scene.test, context.out / "errors")
     rows = [{"view": row.view, **row.values} for row in table.rows]
     context.tracker.table("eval", rows)
-    means = {name: table.mean(name) for name in ("psnr", "ssim", "lpips_01")}
+    means = {name: table.mean(name) for name in TRACKED}
     context.tracker.metrics({f"eval/{name}": value for name, value in means.items() if value is not None})
 
 
 STEP = StepKind(
     "evaluate",
-    3,
+    4,
     evaluate,
     helpers=(
         "rtgs.evaluate.evaluate",

@@ -13,6 +13,7 @@ from rtgs.mesh.tsdf import TsdfSettings
 from rtgs.pipeline import StepContext, StepKind
 
 if TYPE_CHECKING:
+    from rtgs.config.schema import RunConfig
     from rtgs.mesh.tsdf import DepthView, MeshResult
     from rtgs.methods import Method
     from rtgs.scenes.scene import Scene
@@ -33,6 +34,14 @@ class ExtractMeshParams:
     """0: expected depth (2DGS for meshes of real scenes), 1: median depth."""
     obj: bool = False
     """Also write ``mesh.obj``."""
+    source: str = ""
+    """How the transparent object's mesh is found, for the third stage; empty: a mesh of the scene."""
+
+
+def object_params(config: RunConfig) -> ExtractMeshParams:
+    """Parameters of the transparent object's mesh."""
+    mesh = config.mesh
+    return ExtractMeshParams(mesh.tsdf, True, mesh.depth_ratio, mesh.obj, mesh.source)
 
 
 def extract_mesh(params: ExtractMeshParams, context: StepContext) -> None:
@@ -56,6 +65,11 @@ def extract_mesh(params: ExtractMeshParams, context: StepContext) -> None:
     if params.obj:
         write_mesh_obj(context.out / "mesh.obj", result.mesh)
     _write_summary(context.out, result, scene)
+    if params.source:
+        from rtgs.mesh.container import ObjectMesh, write_object_mesh
+
+        record = json.loads((context.out / SUMMARY_FILE).read_text(encoding="utf-8"))
+        write_object_mesh(context.out, ObjectMesh(result.mesh, "tsdf", result.voxel, flat=False), record)
     counts = {"mesh/vertices": float(len(result.mesh.vertices)), "mesh/triangles": float(len(result.mesh.faces))}
     context.tracker.metrics(counts)
     context.log.info("mesh of %d triangles in %d pieces, voxel %.4g", len(result.mesh.faces), result.kept, result.voxel)

@@ -1,4 +1,4 @@
-"""The graph of a run: (sfm, masks, normals ->) import -> one step per stage (-> mesh) -> render, evaluate, report.
+"""The graph of a run: (sfm, masks, normals ->) import -> one step per stage (+ mesh) -> render, evaluate, report.
 
 Pure: from a config to steps with parameters; nothing runs here. Each step is given only what it reads.
 """
@@ -20,16 +20,22 @@ from pipelines import (
     synthesize,
     train_diffuse,
     train_reflection,
+    train_transmittance,
 )
 from pipelines.preparation import SkippedStep, prepare
 from pipelines.training import StageParams
+from pipelines.transparent import Transparency, find_transparency
 from rtgs.config.schema import Choices, RunConfig
 from rtgs.methods import method_stages, stage_settings
 from rtgs.pipeline import Step, StepKind
 from rtgs.pipeline.fingerprint import flatten
 from rtgs.train.settings import MethodSettings, ScheduleSettings
 
-TRAINING: Mapping[str, StepKind] = {"diffuse": train_diffuse.STEP, "reflection": train_reflection.STEP}
+TRAINING: Mapping[str, StepKind] = {
+    "diffuse": train_diffuse.STEP,
+    "reflection": train_reflection.STEP,
+    "transmittance": train_transmittance.STEP,
+}
 """The step that runs a stage, by the name the method gives it."""
 
 KINDS: tuple[StepKind, ...] = (
@@ -76,7 +82,8 @@ def build_graph(config: RunConfig, choices: Choices) -> RunGraph:
     """
     prepared = prepare(config)
     scene = prepared.scene
-    training = _training(config, scene)
+    transparency = find_transparency(config, prepared)
+    training, object_mesh = _training(config, scene, transparency.present)
     rendered = render.STEP.step(render.RenderParams(), scene, *training)
     measured = evaluate.STEP.step(
         evaluate.EvaluateParams(config.evaluation, method_label(choices), choices.preset),
@@ -85,21 +92,43 @@ def build_graph(config: RunConfig, choices: Choices) -> RunGraph:
         rendered,
         tools=_pretrained() if config.evaluation.lpips else (),
     )
-    mesh = extract_mesh.STEP.step(_mesh_params(config), scene, *training) if config.mesh.extract else None
+    skipped = (*prepared.skipped, *_left_out(config, transparency, object_mesh))
+    mesh = object_mesh
+    if mesh is None and config.mesh.extract:
+        mesh = extract_mesh.STEP.step(_mesh_params(config), scene, *training)
     made = (rendered, measured) if mesh is None else (mesh, rendered, measured)
-    params = _report_params(config, choices, prepared.skipped)
+    params = _report_params(config, choices, skipped)
     page = report.STEP.step(params, *prepared.steps, scene, *training, *made)
-    return RunGraph(scene, training, rendered, measured, page, mesh, prepared.skipped)
+    return RunGraph(scene, training, rendered, measured, page, mesh, skipped)
 
 
-def _training(config: RunConfig, scene: Step) -> tuple[Step, ...]:
+def _left_out(config: RunConfig, transparency: Transparency, object_mesh: Step | None) -> tuple[SkippedStep, ...]:
+    """What a run of a method with a third stage does without, and why."""
+    if object_mesh is None:
+        late = "method.transmittance.start leaves it no step"
+        why = late if transparency.present else transparency.why
+        return (SkippedStep("train_transmittance", why),) if config.method.name == "rtgs" else ()
+    if config.mesh.extract:
+        return (
+            SkippedStep("scene mesh", "extract_mesh makes the transparent object's mesh, which the third stage needs"),
+        )
+    return ()
+
+
+def _training(config: RunConfig, scene: Step, transparent: bool) -> tuple[tuple[Step, ...], Step | None]:
+    """One training step per stage, and the object mesh that a third one builds on."""
     method: MethodSettings = replace(config.method, paper_schedule=ScheduleSettings())  # a preset has read it by now
     steps: list[Step] = []
-    for stage in method_stages(method, config.schedule):
+    object_mesh = None
+    for stage in method_stages(method, config.schedule, transparent=transparent):
         own = stage_settings(method, stage.name)  # so that runs that differ elsewhere share the stage
         params = StageParams(own, config.schedule, config.seed, stage.name, stage.from_step, stage.until)
-        steps.append(TRAINING[stage.name].step(params, scene, *steps))
-    return tuple(steps)
+        if stage.name == "transmittance":
+            object_mesh = extract_mesh.STEP.step(extract_mesh.object_params(config), scene, *steps)
+            steps.append(TRAINING[stage.name].step(params, scene, *steps, object_mesh))
+        else:
+            steps.append(TRAINING[stage.name].step(params, scene, *steps))
+    return tuple(steps), object_mesh
 
 
 def _mesh_params(config: RunConfig) -> extract_mesh.ExtractMeshParams:

@@ -89,7 +89,7 @@ def _no_glass(source: Source) -> str:
 def _reads_masks(config: RunConfig) -> bool:
     from rtgs.methods import method_stages
 
-    stages = {stage.name for stage in method_stages(config.method, config.schedule)}
+    stages = {stage.name for stage in method_stages(config.method, config.schedule, transparent=True)}
     return config.method.loss.specular > 0 or config.mesh.only_masked or "transmittance" in stages
 
 

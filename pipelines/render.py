@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from rtgs.methods import RenderedView
 
 TIMES_FILE = "render.json"
+GIVEN = "image_given_masks"  # of methods with a third stage: seen through the view's own mask, not the silhouette
 
 
 @dataclass(frozen=True)
@@ -32,8 +33,8 @@ def render(params: RenderParams, context: StepContext) -> None:
     """Render every test view.
 
     Writes ``images/<stem>.png`` (8 bit), ``views/<stem>.safetensors`` (float32: image (3, H, W) not clamped, depth
-    (H, W) z-depth divided by alpha in world units, normal (3, H, W) world frame where the method has one, alpha (H, W))
-    and ``render.json`` (seconds of each image).
+    (H, W) z-depth divided by alpha in world units, normal (3, H, W) world frame where the method has one, alpha (H, W);
+    with a third stage also ``image_given_masks``) and ``render.json`` (seconds of each image).
     """
     import torch
     from safetensors.torch import save_file
@@ -50,12 +51,16 @@ def render(params: RenderParams, context: StepContext) -> None:
         stem = file_stem(view.name)
         with torch.no_grad():
             start = time.perf_counter()
-            image = method.render(view.camera, stage.until, RenderOptions()).image
+            rendered = method.render(view.camera, stage.until, RenderOptions(), view.mask)
             seconds[view.name] = time.perf_counter() - start
+            image = rendered.image
             tensors = {"image": image.contiguous()}
+            if rendered.transparent is not None and view.mask is not None:
+                given = RenderOptions(masks="given")
+                tensors[GIVEN] = method.render(view.camera, stage.until, given, view.mask).image.contiguous()
             if params.maps:
                 options = RenderOptions(depth=True, normal="normal" in method.maps, layers=True)
-                tensors |= _maps(method.render(view.camera, stage.until, options))
+                tensors |= _maps(method.render(view.camera, stage.until, options, view.mask))
         save_file(tensors, context.out / "views" / f"{stem}.safetensors")
         write_png(context.out / "images" / f"{stem}.png", to_bytes(image))
     (context.out / TIMES_FILE).write_text(json.dumps({"seconds": seconds}, indent=1) + "\n", encoding="utf-8")
@@ -69,7 +74,8 @@ def _maps(rendered: RenderedView) -> dict[str, Tensor]:
     depth = buffers.depth / buffers.alpha.clamp_min(1e-6)  # the buffer holds the sum of w z
     maps = {"depth": depth, "normal": buffers.normal, "alpha": buffers.alpha}
     if rendered.layers is not None:
-        maps |= {name: tensor.float() for name, tensor in vars(rendered.layers).items()}
+        layers = vars(rendered.layers).items()
+        maps |= {name: tensor.float() for name, tensor in layers if tensor is not None}
     return {name: tensor.contiguous() for name, tensor in maps.items() if tensor is not None}
 
 
@@ -88,17 +94,22 @@ def read_timed(folder: Path, view_name: str) -> TimedRender:
 
     seconds = json.loads((folder / TIMES_FILE).read_text(encoding="utf-8"))["seconds"]
     tensors = read_render(folder, view_name)
-    return TimedRender(tensors["image"], seconds[view_name], tensors.get("reflection"))
+    layers = (tensors.get("reflection"), tensors.get("transmission"))
+    return TimedRender(tensors["image"], seconds[view_name], *layers, tensors.get(GIVEN))
 
 
 STEP = StepKind(
     "render",
-    2,
+    3,
     render,
     helpers=(
         "pipelines.training",
         "rtgs.methods.reflective",
         "rtgs.methods.reflection_set",
+        "rtgs.methods.traced_set",
+        "rtgs.methods.transmittance",
+        "rtgs.methods.glass",
+        "rtgs.mesh.container",
         "rtgs.methods.mirror",
         "rtgs.methods.traced_pixels",
         "rtgs.gaussians.materials",

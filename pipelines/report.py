@@ -9,7 +9,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipelines import extract_mesh
+from pipelines import extract_mesh, train_transmittance
 from pipelines.evaluate import TABLE_JSON
 from pipelines.render import read_render
 from pipelines.training import last_training, read_history, read_summary
@@ -54,6 +54,7 @@ def report(params: ReportParams, context: StepContext) -> None:
     decisions = [Decision(*item) for item in params.decisions]
     decisions += _masks(inputs)
     decisions += [Decision(**item) for item in summary["decisions"]]  # pyright: ignore[reportGeneralTypeIssues]
+    decisions += _boundary(training)
     data = ReportData(
         title=params.title,
         evaluation=table,
@@ -105,8 +106,22 @@ def _layers(maps: dict[str, Tensor]) -> dict[str, Tensor]:
     """The layers of a rendered view as the page takes them; none for methods without reflection."""
     if "reflection" not in maps:
         return {}
-    names = ("reflection", "normal", "specular", "roughness", "f0")
+    names = ("reflection", "transmission", "normal", "specular", "roughness", "f0")
     return {"diffuse": (1 - maps["specular"]) * maps["diffuse"]} | {name: maps[name] for name in names if name in maps}
+
+
+def _boundary(training: Path) -> list[Decision]:
+    """How well the transparent object's surface is known, where a third stage has written it down."""
+    from rtgs.evaluate.boundary import BoundaryScores
+    from rtgs.report.page import Decision
+
+    path = training / train_transmittance.BOUNDARY_FILE
+    if not path.is_file():
+        return []
+    scores = json.loads(path.read_text(encoding="utf-8"))
+    return [
+        Decision(f"object's surface {when} the third stage", str(BoundaryScores(**scores[when]))) for when in scores
+    ]
 
 
 def _mesh(folder: Path) -> MeshFigure:

@@ -20,6 +20,7 @@ STEP = StepKind(
         *train_diffuse.STEP.helpers,
         "rtgs.methods.reflective",
         "rtgs.methods.reflection_set",
+        "rtgs.methods.traced_set",
         "rtgs.methods.mirror",
         "rtgs.methods.traced_pixels",
         "rtgs.methods.propagation",

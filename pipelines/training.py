@@ -18,12 +18,14 @@ from rtgs.track import Tracker
 from rtgs.train.settings import MethodSettings, ScheduleSettings
 
 if TYPE_CHECKING:
+    from rtgs.mesh.container import ObjectMesh
     from rtgs.methods import Method
     from rtgs.scenes.scene import Scene
 
 CHECKPOINT_FOLDER = "checkpoint"
 SUMMARY_FILE = "summary.json"
 HISTORY_FILE = "history.jsonl"
+OBJECT_FOLDER = "object_mesh"
 
 
 @dataclass(frozen=True)
@@ -38,16 +40,18 @@ class StageParams:
     until: int
 
 
-def train_stage(params: StageParams, context: StepContext) -> None:
+def train_stage(params: StageParams, context: StepContext, object_mesh: ObjectMesh | None = None) -> Method:
     """Train from ``from_step`` to ``until`` on the scene, going on from a checkpoint of a killed attempt.
 
     Writes ``checkpoint/`` (state of the method at the end), ``<set>.ply`` for every set of surfels, ``summary.json``,
-    and ``history.jsonl`` (the recorded metrics).
+    ``history.jsonl`` (the recorded metrics), and with an ``object_mesh`` a copy of it in ``object_mesh/``. Returns the
+    trained method.
 
     Raises:
         TrainingDiverged: a loss or gradient is not finite.
     """
     from rtgs.gaussians.ply import write_ply
+    from rtgs.mesh.container import write_object_mesh
     from rtgs.methods import Stage, create_method
     from rtgs.scenes.canonical import read_scene
     from rtgs.train.progress import progress_for
@@ -55,7 +59,8 @@ def train_stage(params: StageParams, context: StepContext) -> None:
     from rtgs.train.trainer import Trainer
 
     scene = read_scene(context.inputs["import_scene"])
-    method = create_method(params.method, scene, params.schedule, generator_for(params.seed, "initialise"))
+    generator = generator_for(params.seed, "initialise")
+    method = create_method(params.method, scene, params.schedule, generator, object_mesh)
     stage = Stage(params.stage, params.from_step, params.until)
     checkpoints = context.partial / "checkpoints"
     _start_from_stage_before(context, checkpoints)
@@ -72,6 +77,9 @@ def train_stage(params: StageParams, context: StepContext) -> None:
     summary = trainer.run()
     newest = max(checkpoints.glob("step_*"))
     shutil.copytree(newest, context.out / CHECKPOINT_FOLDER)
+    if object_mesh is not None:
+        (context.out / OBJECT_FOLDER).mkdir()
+        write_object_mesh(context.out / OBJECT_FOLDER, object_mesh)
     for surfel_set in method.sets:
         write_ply(context.out / f"{surfel_set.name}.ply", surfel_set.surfels)
     record = {key: _finite(value) for key, value in asdict(summary).items()}
@@ -79,6 +87,7 @@ def train_stage(params: StageParams, context: StepContext) -> None:
     recorder.write_history(context.out / HISTORY_FILE)
     numbers = {f"final/{key}": value for key, value in record.items() if isinstance(value, (int, float))}
     context.tracker.metrics(numbers)
+    return method
 
 
 def _start_from_stage_before(context: StepContext, checkpoints: Path) -> None:
@@ -148,13 +157,15 @@ def stage_params(folder: Path) -> StageParams:
 
 
 def load_method(folder: Path, scene: Scene) -> tuple[Method, StageParams]:
-    """The method as it was at the end of a training stage."""
+    """The method as it was at the end of a training stage, with the object mesh that the artifact carries."""
+    from rtgs.mesh.container import read_object_mesh
     from rtgs.methods import create_method
     from rtgs.train.checkpoint import load_checkpoint
     from rtgs.train.seeds import generator_for
 
     params = stage_params(folder)
-    method = create_method(params.method, scene, params.schedule, generator_for(params.seed, "initialise"))
+    mesh = read_object_mesh(folder / OBJECT_FOLDER) if (folder / OBJECT_FOLDER).is_dir() else None
+    method = create_method(params.method, scene, params.schedule, generator_for(params.seed, "initialise"), mesh)
     tensors = load_checkpoint(folder / CHECKPOINT_FOLDER).tensors
     prefix = "method."
     method.load({name[len(prefix) :]: tensor for name, tensor in tensors.items() if name.startswith(prefix)})

@@ -88,6 +88,8 @@ class MeshConfig:
     """0: expected depth (2DGS for meshes of real scenes), 1: median depth."""
     obj: bool = False
     """Also write an OBJ file."""
+    source: str = "auto"
+    """Of the transparent object's mesh, for the third stage: ``hull``, ``tsdf``, ``given`` or ``auto``."""
     tsdf: TsdfSettings = field(default_factory=TsdfSettings)
 
 

@@ -13,13 +13,15 @@ from typing import Protocol
 from torch import Tensor
 
 from rtgs.evaluate.images import ERROR_FULL_SCALE, error_map, error_scale_note, file_stem, write_png
-from rtgs.evaluate.layers import LAYER_METRICS, LayerTruth, layer_scores, reflection_scale, why_absent
+from rtgs.evaluate.layers import LAYER_METRICS, LayerTruth, layer_scales, layer_scores, why_absent
 from rtgs.evaluate.lpips import InputRange, Lpips, lpips
 from rtgs.evaluate.metrics import psnr, quantized, ssim
 from rtgs.evaluate.weights import MissingWeights, WrongWeights
 
 FORMAT = "rtgs-evaluation"
-VERSION = 2  # 2: the layer metrics
+VERSION = 3  # 2: the layer metrics; 3: transmission, given masks
+# Seen through the test views' own masks instead of the mesh's silhouette (methods.md 7; register row 21).
+GIVEN_MASK_METRICS = ("psnr_given_masks", "psnr_masked_given_masks", "ssim_masked_given_masks")
 # In the order of the columns. Higher is better for psnr*, ssim*; lower for lpips*.
 METRICS = (
     "psnr",
@@ -31,6 +33,7 @@ METRICS = (
     "lpips_01_masked",
     "lpips_11_masked",
     *LAYER_METRICS,
+    *GIVEN_MASK_METRICS,
     "psnr_8bit",
     "ssim_8bit",
     "lpips_01_8bit",
@@ -59,6 +62,8 @@ class TimedRender:
     image: Tensor  # (3, H, W)
     seconds: float | None = None  # wall time of the render call
     reflection: Tensor | None = None  # (3, H, W) k_s w_r C_r, of methods that render it
+    transmission: Tensor | None = None  # (3, H, W) k_s w_t C_t, likewise
+    given_masks: Tensor | None = None  # (3, H, W) the image through the view's own mask, likewise
 
 
 @dataclass(frozen=True)
@@ -103,6 +108,7 @@ class EvaluationTable:
     rows: tuple[ViewScore, ...]
     missing: dict[str, str] = field(default_factory=dict)  # metric -> why it is absent (in all views, or in some)
     reflection_scale: float | None = None  # of psnr_reflection_scaled
+    transmission_scale: float | None = None  # of psnr_transmission_scaled
 
     def mean(self, metric: str) -> float | None:
         """Mean over the views that have the metric; None when none has."""
@@ -170,18 +176,18 @@ def evaluate_views(
     missing: dict[str, str] = {}
     if model is None:
         missing.update({name: reason for name in METRICS if name.startswith("lpips")})
-    rows, scale = [], reflection_scale(renders, views)
+    rows, scales = [], layer_scales(renders, views)
     for render, view in zip(renders, views, strict=True):
         try:
             score = _score(render, view, settings, model)
-            score.values.update(layer_scores(render, view, scale))
+            score.values.update(layer_scores(render, view, scales))
         except (TypeError, ValueError) as error:
             raise type(error)(f"view {view.name!r}: {error}") from error
         rows.append(score)
     absent = [name for name in LAYER_METRICS if any(row.values[name] is None for row in rows)]
     missing |= {name: why_absent(name, renders, views) for name in absent}
     _explain_absent(rows, settings, missing)
-    return EvaluationTable(facts, tuple(rows), missing, scale)
+    return EvaluationTable(facts, tuple(rows), missing, scales["reflection"], scales["transmission"])
 
 
 def _score(render: TimedRender, view: PhotoView, settings: EvaluationSettings, model: Lpips | None) -> ViewScore:
@@ -199,6 +205,11 @@ def _score(render: TimedRender, view: PhotoView, settings: EvaluationSettings, m
         if model is not None:
             for convention in InputRange:
                 values[f"{convention.value}_masked"] = lpips(model, image, target, convention, mask=mask)
+    if settings.masked and render.given_masks is not None:
+        values["psnr_given_masks"] = psnr(render.given_masks, target)
+        if mask is not None and bool(mask.any()):
+            values["psnr_masked_given_masks"] = psnr(render.given_masks, target, mask=mask)
+            values["ssim_masked_given_masks"] = ssim(render.given_masks, target, mask=mask)
     if settings.eight_bit:
         image_8bit, target_8bit = quantized(image.double()), quantized(target.double())
         values["psnr_8bit"], values["ssim_8bit"] = psnr(image_8bit, target_8bit), ssim(image_8bit, target_8bit)
@@ -216,8 +227,10 @@ def _explain_absent(rows: Sequence[ViewScore], settings: EvaluationSettings, mis
             continue
         if name.endswith("_8bit"):
             missing[name] = "switched off (evaluation.eight_bit=false)"
-        elif name.endswith("_masked") and not settings.masked:
+        elif (name.endswith("_masked") or name in GIVEN_MASK_METRICS) and not settings.masked:
             missing[name] = "switched off (evaluation.masked=false)"
+        elif name in GIVEN_MASK_METRICS:
+            missing[name] = "the method has no stage for transparent objects, or the view no mask"
         elif name.endswith("_masked"):
             missing[name] = f"{absent} of {len(rows)} views have no mask, or an empty one"
         else:
@@ -253,6 +266,7 @@ def write_json(path: Path, table: EvaluationTable) -> None:
         "count": {name: table.count(name) for name in METRICS},
         "missing": table.missing,
         "reflection_scale": table.reflection_scale,
+        "transmission_scale": table.transmission_scale,
         "views": [asdict(row) for row in table.rows],
     }
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -274,6 +288,7 @@ def read_json(path: Path) -> EvaluationTable:
         tuple(ViewScore(**row) for row in document["views"]),
         document["missing"],
         document["reflection_scale"],
+        document["transmission_scale"],
     )
 
 

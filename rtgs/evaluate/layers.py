@@ -16,7 +16,12 @@ from torch import Tensor
 from rtgs.evaluate.metrics import psnr
 from rtgs.scenes.truth import srgb_from_linear
 
-LAYER_METRICS = ("psnr_specular", "psnr_diffuse_part", "psnr_reflection", "psnr_reflection_scaled")
+LAYERS = {"reflection": "reflected", "transmission": "transmitted"}  # of a render, by the name of their truth
+LAYER_METRICS = (
+    "psnr_specular",
+    "psnr_diffuse_part",
+    *(f"psnr_{layer}{scaled}" for layer in LAYERS for scaled in ("", "_scaled")),
+)
 
 
 class LayerTruth(Protocol):
@@ -26,6 +31,8 @@ class LayerTruth(Protocol):
     def specular(self) -> Tensor: ...  # (H, W) bool: the first surface is mirror, glossy or glass
     @property
     def reflected(self) -> Tensor: ...  # (3, H, W) linear light x exposure
+    @property
+    def transmitted(self) -> Tensor: ...  # likewise
 
 
 class LayeredRender(Protocol):
@@ -33,6 +40,8 @@ class LayeredRender(Protocol):
     def image(self) -> Tensor: ...  # (3, H, W)
     @property
     def reflection(self) -> Tensor | None: ...  # (3, H, W) the layer as it is added to the image, sRGB encoding
+    @property
+    def transmission(self) -> Tensor | None: ...  # likewise
 
 
 class ViewWithTruth(Protocol):
@@ -47,25 +56,33 @@ def encoded(light: Tensor) -> Tensor:
     return torch.from_numpy(srgb_from_linear(light.detach().numpy())).float()
 
 
-def reflection_scale(renders: Sequence[LayeredRender], views: Sequence[ViewWithTruth]) -> float | None:
-    """The factor on all rendered reflections of a scene that fits the encoded truth best, by least squares over the
-    specular pixels; None without truth, without reflections, or where all of them are black."""
+def layer_scales(renders: Sequence[LayeredRender], views: Sequence[ViewWithTruth]) -> dict[str, float | None]:
+    """By layer: the factor on it in all views of a scene that fits the encoded truth best, by least squares over the
+    specular pixels; None without truth, without the layer, or where all of it is black."""
+    return {layer: _scale(layer, renders, views) for layer in LAYERS}
+
+
+def _scale(layer: str, renders: Sequence[LayeredRender], views: Sequence[ViewWithTruth]) -> float | None:
     matched, power = 0.0, 0.0
     for render, view in zip(renders, views, strict=True):
-        if view.truth is None or render.reflection is None:
+        light = getattr(render, layer)
+        if view.truth is None or light is None:
             continue
         inside = view.truth.specular
-        rendered = render.reflection.double()[:, inside]
-        matched += float((rendered * encoded(view.truth.reflected).double()[:, inside]).sum())
+        rendered = light.double()[:, inside]
+        matched += float((rendered * encoded(getattr(view.truth, LAYERS[layer])).double()[:, inside]).sum())
         power += float(rendered.square().sum())
     return matched / power if power > 0 else None
 
 
-def layer_scores(render: LayeredRender, view: ViewWithTruth, scale: float | None) -> dict[str, float | None]:
+def layer_scores(
+    render: LayeredRender, view: ViewWithTruth, scales: dict[str, float | None]
+) -> dict[str, float | None]:
     """The LAYER_METRICS of one view, dB; None where the view has no such pixels, no truth, or the render no layer.
 
-    ``psnr_specular`` and ``psnr_diffuse_part``: the image on and off specular objects. ``psnr_reflection``: the
-    reflected layer on specular objects against the encoded truth; ``_scaled``: after the scene's one ``scale``.
+    ``psnr_specular`` and ``psnr_diffuse_part``: the image on and off specular objects. ``psnr_reflection`` and
+    ``psnr_transmission``: the layer on specular objects against the encoded truth; ``_scaled``: after the scene's one
+    factor of ``scales``.
     """
     scores: dict[str, float | None] = dict.fromkeys(LAYER_METRICS)
     if view.truth is None:
@@ -74,11 +91,14 @@ def layer_scores(render: LayeredRender, view: ViewWithTruth, scale: float | None
     for name, mask in (("psnr_specular", inside), ("psnr_diffuse_part", ~inside)):
         if mask.any():
             scores[name] = psnr(render.image, view.image, mask=mask)
-    if render.reflection is not None and inside.any():
-        truth = encoded(view.truth.reflected)
-        scores["psnr_reflection"] = psnr(render.reflection, truth, mask=inside)
+    for layer, light in LAYERS.items():
+        rendered, scale = getattr(render, layer), scales[layer]
+        if rendered is None or not inside.any():
+            continue
+        truth = encoded(getattr(view.truth, light))
+        scores[f"psnr_{layer}"] = psnr(rendered, truth, mask=inside)
         if scale is not None:
-            scores["psnr_reflection_scaled"] = psnr(render.reflection * scale, truth, mask=inside)
+            scores[f"psnr_{layer}_scaled"] = psnr(rendered * scale, truth, mask=inside)
     return scores
 
 
@@ -89,9 +109,11 @@ def why_absent(metric: str, renders: Sequence[LayeredRender], views: Sequence[Vi
         return "the scene has no truth: only path-traced captures know their layers"
     if without:
         return f"{without} of {len(views)} views have no truth"
-    if metric.startswith("psnr_reflection") and any(render.reflection is None for render in renders):
-        return "the method renders no reflected layer"
-    if metric == "psnr_reflection_scaled" and reflection_scale(renders, views) is None:
-        return "the rendered reflections are black"
+    for layer, light in LAYERS.items():
+        if metric.startswith(f"psnr_{layer}"):
+            if any(getattr(render, layer) is None for render in renders):
+                return f"the method renders no {light} layer"
+            if metric.endswith("_scaled") and _scale(layer, renders, views) is None:
+                return f"the rendered {layer} is black"
     part = "pixel off specular objects" if metric == "psnr_diffuse_part" else "pixel on a specular object"
     return f"some of the {len(views)} views have no {part}"

@@ -60,7 +60,7 @@ def layer_pixels(
 _TITLES = {
     "diffuse": ("Diffuse", "what the base set adds to the image, (1 − k_s) C_d; truth: diffuse light, sRGB encoded"),
     "reflection": ("Reflection", "k_s w_r C_r; truth: specularly reflected light, sRGB encoded"),
-    "transmission": ("Transmission", "truth: light through the first surface, sRGB encoded"),
+    "transmission": ("Transmission", "k_s w_t C_t; truth: light through the first surface, sRGB encoded"),
     "normal": ("Normal", "camera frame: red right, green up, blue towards the viewer"),
     "specular": ("Specular k_s", "0 black, 1 white; truth: specular objects"),
     "roughness": ("Roughness", "0 black, 1 white"),

@@ -1,0 +1,65 @@
+"""The third stage of RT-GS: straight rays through the transparent object, all sets jointly."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+from pipelines import train_reflection
+from pipelines.training import StageParams, load_method, train_stage
+from rtgs.pipeline import StepContext, StepKind
+
+if TYPE_CHECKING:
+    from rtgs.evaluate.boundary import BoundaryScores
+
+BOUNDARY_FILE = "boundary.json"
+
+
+def train_transmittance(params: StageParams, context: StepContext) -> None:
+    """Go on from the reflection stage with the object mesh of ``extract_mesh``.
+
+    Writes what :func:`pipelines.training.train_stage` writes, ``object_mesh/`` (a copy of the mesh: whoever loads the
+    method needs this artifact alone) and ``boundary.json``: how well the object's surface is known where the stage
+    begins and where it ends (:class:`rtgs.evaluate.boundary.BoundaryScores`).
+
+    Raises:
+        TrainingDiverged: a loss or gradient is not finite.
+    """
+    from rtgs.evaluate.boundary import boundary_scores
+    from rtgs.mesh.container import read_object_mesh
+    from rtgs.scenes.canonical import read_scene
+
+    scene = read_scene(context.inputs["import_scene"])
+    mesh = read_object_mesh(context.inputs["extract_mesh"])
+    before, stage = load_method(context.inputs["train_reflection"], scene)
+    scores = {"before": boundary_scores(before, scene, mesh, stage.until)}
+    del before
+    method = train_stage(params, context, mesh)
+    scores["after"] = boundary_scores(method, scene, mesh, params.until)
+    text = json.dumps({when: vars(values) for when, values in scores.items()}, indent=1)
+    (context.out / BOUNDARY_FILE).write_text(text + "\n", encoding="utf-8")
+    for when, values in scores.items():
+        context.log.info("%s the third stage: %s", when, values)
+        context.tracker.metrics(_numbers(values, when))
+
+
+def _numbers(scores: BoundaryScores, when: str) -> dict[str, float]:
+    return {f"boundary/{when}/{name}": value for name, value in vars(scores).items() if isinstance(value, float)}
+
+
+STEP = StepKind(
+    "train_transmittance",
+    1,
+    train_transmittance,
+    helpers=(
+        *train_reflection.STEP.helpers,
+        "rtgs.methods.transmittance",
+        "rtgs.methods.transmittance_set",
+        "rtgs.methods.interface_set",
+        "rtgs.methods.glass",
+        "rtgs.evaluate.boundary",
+        "rtgs.mesh.container",
+        "rtgs.mesh.guide",
+        "rtgs.mesh.normals",
+    ),
+)

@@ -1,0 +1,101 @@
+"""How well a method knows the surface of a transparent object, which its third stage stands and falls with (glass.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from rtgs.mesh.container import ObjectGuide, ObjectMesh
+from rtgs.methods.base import RenderedView, RenderOptions
+from rtgs.train.losses import surface_depth
+
+if TYPE_CHECKING:
+    from rtgs.methods.base import Method
+    from rtgs.scenes.scene import Scene, View
+
+DEPTH_TOLERANCE = 0.03  # of the true depth
+NORMAL_TOLERANCE = 15.0  # degrees
+
+
+@dataclass(frozen=True)
+class BoundaryScores:
+    """Shares are of masked pixels, over the test views with truth; None: no test view has truth and a mask."""
+
+    silhouette_iou: float | None  # of the mesh with the masks of the training views; None: no masks
+    depth_share: float | None  # rasterised first surface within 3 % of the truth
+    normal_share: float | None  # rasterised normal within 15 degrees of the truth
+    normal_degrees: float | None  # median angle to the true normal
+    mesh_depth_share: float | None  # the mesh's first surface within 3 % of the truth
+    specular: float | None  # mean k_s in the masks of the training views
+
+    def __str__(self) -> str:
+        words = {
+            "silhouettes IoU": self.silhouette_iou,
+            "depth within 3 %": self.depth_share,
+            "normal within 15 deg": self.normal_share,
+            "median normal error deg": self.normal_degrees,
+            "mesh within 3 %": self.mesh_depth_share,
+            "mean k_s": self.specular,
+        }
+        return ", ".join(f"{name} {value:.3g}" for name, value in words.items() if value is not None)
+
+
+def boundary_scores(method: Method, scene: Scene, mesh: ObjectMesh, step: int) -> BoundaryScores:
+    """Render the views of a scene and compare the object's surface in its masks with the truth, where there is one."""
+    guide = ObjectGuide(mesh)
+    common = whole = 0
+    weights = pixels = 0.0
+    for view in scene.train:
+        if view.mask is None:
+            continue
+        hit = guide.surfaces(view.camera).hit
+        common, whole = common + int((hit & view.mask).sum()), whole + int((hit | view.mask).sum())
+        specular = _rendered(method, view, step).specular
+        if specular is not None:
+            weights, pixels = weights + float(specular[view.mask].sum()), pixels + float(view.mask.sum())
+    parts = [_against_truth(method, view, guide, step) for view in _with_truth(scene.test)]
+    depth, angle, near = (torch.cat([part[k] for part in parts]) if parts else torch.zeros(0) for k in range(3))
+    return BoundaryScores(
+        silhouette_iou=common / whole if whole else None,
+        depth_share=_share(depth < DEPTH_TOLERANCE),
+        normal_share=_share(angle < NORMAL_TOLERANCE),
+        normal_degrees=float(angle.median()) if len(angle) else None,
+        mesh_depth_share=_share(near < DEPTH_TOLERANCE),
+        specular=weights / pixels if pixels else None,
+    )
+
+
+def _with_truth(views: Iterable[View]) -> list[View]:
+    return [view for view in views if view.truth is not None and view.mask is not None and bool(view.mask.any())]
+
+
+def _rendered(method: Method, view: View, step: int) -> RenderedView:
+    options = RenderOptions(depth=True, normal="normal" in method.maps)
+    with torch.no_grad():
+        return method.render(view.camera, step, options, view.mask)
+
+
+def _against_truth(method: Method, view: View, guide: ObjectGuide, step: int) -> tuple[Tensor, Tensor, Tensor]:
+    """In the mask: relative error of the rasterised depth, degrees between normals, relative error of the mesh."""
+    truth, mask = view.truth, view.mask
+    assert truth is not None
+    assert mask is not None
+    buffers = _rendered(method, view, step).buffers
+    assert buffers.depth is not None
+    assert buffers.normal is not None
+    inside = mask & (truth.depth > 0)
+    true = truth.depth[inside]
+    depth = (surface_depth(buffers.depth, buffers.alpha)[inside] / true - 1).abs()
+    near = (guide.surfaces(view.camera).near[inside] / true - 1).abs()
+    local = torch.einsum("ij,jhw->ihw", view.camera.rotation.float(), buffers.normal)[:, inside]
+    unit = torch.nn.functional.normalize(local, dim=0)
+    angle = torch.rad2deg(torch.acos((unit * truth.normal[:, inside]).sum(0).clamp(-1, 1)))
+    return depth, angle, near
+
+
+def _share(found: Tensor) -> float | None:
+    return float(found.double().mean()) if len(found) else None
