@@ -23,7 +23,7 @@ TABLE = $(BIN)/rtgs run preset=$(PRESET) $(SEED_LIST) hydra.launcher.workers=$(W
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test e2e bench lint format dashboard accept-steps contact-sheet clean
-.PHONY: reproduce-table1 reproduce-table2 reproduce-fig-split-sum
+.PHONY: reproduce-table1 reproduce-table2 reproduce-table3 reproduce-fig-split-sum
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-24s %s\n", $$1, $$2}'
@@ -49,6 +49,9 @@ reproduce-table1: setup ## mirrors: every method on every scene, ends with table
 
 reproduce-table2: setup ## thin glass: the same for Table 2
 	$(TABLE) experiment=table2 $(RUN)
+
+reproduce-table3: setup ## what each part of the third stage is worth
+	$(TABLE) experiment=table3 $(RUN)
 
 reproduce-fig-split-sum: setup ## microfacet weight against split-sum shading
 	$(TABLE) experiment=fig_split_sum $(RUN)

@@ -41,7 +41,7 @@ class ExtractMeshParams:
 def object_params(config: RunConfig) -> ExtractMeshParams:
     """Parameters of the transparent object's mesh."""
     mesh = config.mesh
-    return ExtractMeshParams(mesh.tsdf, True, mesh.depth_ratio, mesh.obj, mesh.source)
+    return ExtractMeshParams(mesh.tsdf, mesh.of == "object", mesh.depth_ratio, mesh.obj, mesh.source)
 
 
 def extract_mesh(params: ExtractMeshParams, context: StepContext) -> None:

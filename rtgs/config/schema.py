@@ -90,6 +90,8 @@ class MeshConfig:
     """Also write an OBJ file."""
     source: str = "auto"
     """Of the transparent object's mesh, for the third stage: ``hull``, ``tsdf``, ``given`` or ``auto``."""
+    of: str = "object"
+    """What the third stage's TSDF mesh is of: the masked ``object``, or the ``scene`` (register row 15)."""
     tsdf: TsdfSettings = field(default_factory=TsdfSettings)
 
 

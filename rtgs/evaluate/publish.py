@@ -52,6 +52,8 @@ QUALITY = (
 )
 COSTS = (
     Metric("psnr_masked", "PSNR in the mask", 2, True),
+    Metric("ssim_masked", "SSIM in the mask", 3, True),
+    Metric("psnr_masked_given_masks", "PSNR in the mask, given masks", 2, True),
     Metric("train_seconds", "training s", 0, None),
     Metric("peak_memory_mb", "memory MB", 0, None),
     Metric("surfels", "Gaussians", 0, None),

@@ -26,6 +26,11 @@ ABLATIONS = [name for name in choices_of("ablation") if name != "none"]
 REFUSED = {  # ablations that have no object in these methods
     "no_normal_loss": ("3dgs",),
     "split_sum": ("2dgs", "3dgs", "envgs"),
+    **dict.fromkeys(
+        ("two_stages", "no_transmittance_gaussians", "no_specular_loss", "no_depth_loss", "no_mesh_guide"),
+        ("2dgs", "3dgs", "envgs"),
+    ),
+    **dict.fromkeys(("mesh_tsdf", "mesh_hull", "paper_glass"), ("2dgs", "3dgs", "envgs")),
 }
 SCENES = [name for name in choices_of("scene") if name != "capture"]
 

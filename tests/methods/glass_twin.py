@@ -1,0 +1,151 @@
+"""The composed render of the third stage in float64, by the readable twins alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import torch
+from torch import Tensor
+
+from rtgs.cameras import Camera
+from rtgs.gaussians.materials import MaterialSurfels, activate_materials
+from rtgs.gaussians.surfels import ActivatedSurfels, Surfels, activate
+from rtgs.methods.mirror import SHORTEST_NORMAL, SurfacePixels, mirror_rays, pixel_weights, surface_pixels
+from rtgs.methods.transmittance import TransmissiveMethod
+from rtgs.render import reference, reference_trace
+from rtgs.render.buffers import TraceBuffers, TraceOptions
+from rtgs.render.discontinuities import discontinuity_mask
+from rtgs.render.trace_discontinuities import fragile_rays
+
+Sets = dict[str, Surfels]
+
+
+@dataclass(frozen=True)
+class TwinGlass:
+    image: Tensor  # (3, H, W) float64
+    first_depth: Tensor  # (R,) Z_1 of the pixels with a second surface
+    fragile: Tensor  # (H, W) bool: a decision lies within float32 rounding of its threshold
+
+
+def doubled(surfels: Surfels) -> Surfels:
+    """A float64 copy that requires gradients."""
+    values = {name: tensor.detach().double().requires_grad_() for name, tensor in surfels.items()}
+    return type(surfels)(**values)
+
+
+class GlassTwin:
+    """Reads a method's settings and plan, and none of its renderers."""
+
+    def __init__(self, method: TransmissiveMethod, sets: Sets, camera: Camera, step: int) -> None:
+        self.method, self.sets, self.camera, self.step = method, sets, camera, step
+        self.settings = method.settings.transmittance
+        self.fragile = torch.zeros(camera.height * camera.width, dtype=torch.bool)
+
+    def render(self, inside: Tensor) -> TwinGlass:
+        """The view whose pixels ``inside`` (H, W) look through the object."""
+        assert self.method.guide is not None
+        surfaces = self.method.guide.surfaces(self.camera)
+        flat, covered = self._surface()
+        inside, known = inside.flatten(), inside.flatten() & surfaces.hit.flatten()
+        if self.settings.first_surface == "mesh":
+            flat = replace(flat, depth=torch.where(known, surfaces.near.flatten().double(), flat.depth))
+        covered &= flat.depth > 0
+        rays = self.camera.rays(torch.float64)
+        view = rays.directions.reshape(-1, 3).T
+        kind = self.method.settings.reflection.sh_direction
+        mirrored = mirror_rays(flat, rays.origin, view, kind)
+        options = replace(self.method._trace_options(self.step, False), weight_sum=False)
+        everyone = torch.arange(view.shape[1])
+        reflected = self._trace("reflection", mirrored.origins, mirrored.directions, options, everyone)
+        weights = pixel_weights(mirrored.cosine, flat, self.method.settings.optics)
+        assert reflected.colors is not None
+        light = weights.reflection * reflected.colors.T
+        rows = (inside & covered).nonzero()[:, 0]
+        near = flat.depth.detach()[rows]
+        second = (surfaces.second.flatten() & known)[rows]
+        far = torch.where(second, torch.maximum(surfaces.far.flatten().double()[rows], near), near)
+        color, first = self._through(rays.origin, view[:, rows].T, near, far, second, rows)
+        light = light + weights.transmission * torch.zeros_like(light).index_copy(1, rows, color.T)
+        change = torch.where(covered, flat.specular * (light - flat.diffuse), 0.0)
+        shape = (self.camera.height, self.camera.width)
+        image = (flat.diffuse + change).reshape(3, *shape)
+        depth = first.depth if first.depth is not None else near
+        return TwinGlass(image, depth[second], self.fragile.reshape(shape))
+
+    def _surface(self) -> tuple[SurfacePixels, Tensor]:
+        settings = self.method.settings
+        parts = [self._activated(name) for name in ("base", "interface") if name in self.sets]
+        surfels = [part[0] for part in parts]
+        names = ("means", "tangent_u", "tangent_v", "scales", "opacities")
+        shape = [torch.cat([getattr(part, name) for part in surfels]) for name in names]
+        features = torch.cat([part[1] for part in parts])
+        options = self.method.raster_options(self.method.training_options(self.step), weight_sum=False)
+        buffers = reference.rasterize_surfels(*shape, features, self.camera, options=options)
+        assert buffers.depth is not None
+        assert buffers.normal is not None
+        alpha = buffers.alpha.flatten()
+        depth = buffers.depth.flatten() / alpha.clamp_min(1e-6)
+        flat = surface_pixels(buffers.features.flatten(1), alpha, depth, buffers.normal.flatten(1), settings.materials)
+        length = flat.normal.norm(dim=0)
+        self.fragile |= discontinuity_mask(*shape, features, self.camera, options=options).flatten()
+        self.fragile |= (length < 0.05) | ((alpha - settings.reflection.smallest_alpha).abs() < 1e-4)
+        return flat, (alpha > settings.reflection.smallest_alpha) & (length > SHORTEST_NORMAL)
+
+    def _activated(self, name: str) -> tuple[ActivatedSurfels, Tensor]:
+        raw = self.sets[name]
+        assert isinstance(raw, MaterialSurfels)
+        surfels = activate(raw, self.camera.center, self.method.sh_degree(self.step))
+        made = activate_materials(raw, self.method.settings.materials)
+        return surfels, torch.cat((surfels.colors, made.specular[:, None], made.roughness[:, None], made.f0), 1)
+
+    def _trace(
+        self, name: str, origins: Tensor, directions: Tensor, options: TraceOptions, pixels: Tensor
+    ) -> TraceBuffers:
+        raw = self.sets[name]
+        active = activate(raw, self.camera.center, 0)
+        shape = (active.means, active.tangent_u, active.tangent_v, active.scales, active.opacities)
+        colors = {"sh_dc": raw.sh_dc, "sh_rest": raw.sh_rest}
+        self.fragile[pixels] |= fragile_rays(*shape, origins, directions, **colors, options=options)
+        return reference_trace.trace_surfels(*shape, origins, directions, **colors, options=options)
+
+    def _through(
+        self, center: Tensor, rays: Tensor, near: Tensor, far: Tensor, second: Tensor, rows: Tensor
+    ) -> tuple[Tensor, TraceBuffers]:
+        settings, method = self.settings, self.method
+        assert method.guide is not None
+        thickness = far - near
+        options = TraceOptions(
+            t_min=settings.offset * method.extent,
+            transmittance_cutoff=settings.transmittance_cutoff,
+            alpha_cutoff=settings.alpha_cutoff,
+            sh_degree=method.sh_degree(self.step),
+            depth=True,
+            sh_direction=method.settings.reflection.sh_direction,  # type: ignore[arg-type]
+        )
+        origins = center + near[:, None] * rays
+        if "transmittance" not in self.sets:
+            first = self._trace("base", origins, rays, replace(options, t_max=thickness), rows)
+        else:
+            bound = torch.where(second, thickness, torch.inf) if settings.first_bounce_end == "clip" else torch.inf
+            own = replace(options, t_max=bound, sh_degree=method._own_degree(self.step))
+            first = self._trace("transmittance", origins, rays, own, rows)
+        assert first.colors is not None
+        assert first.depth is not None
+        left = 1 - first.alpha
+        back = near + first.depth.detach() if settings.second_bounce == "first_bounce" else far
+        start = settings.second_offset * method.guide.mesh.voxel / rays.norm(dim=1)
+        then = replace(options, t_min=start, depth=False)
+        behind = self._trace("base", center + back[:, None] * rays, rays, then, rows).colors
+        assert behind is not None
+        if not settings.second_bounce_gradient:
+            behind = behind.detach()
+        if settings.compositing == "sum":
+            return first.colors + behind, first
+        self.fragile[rows] |= (left.detach() - settings.opaque).abs() < 1e-4
+        shown = left.detach() > settings.opaque
+        return first.colors + torch.where(shown[:, None], left[:, None] * behind, 0.0), first
+
+
+def raw_fields(kind: type[Surfels]) -> list[str]:
+    """Names of a kind's parameters."""
+    return [field.name for field in fields(kind)]

@@ -1,0 +1,271 @@
+"""The third stage: where it begins, what it shows, what it leaves alone, and how it goes on after a kill."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from glass_cases import GlassScene, ball_mesh, begun, glass_recipe, glass_scene, new_glass_method, train_stages
+from reflective_cases import schedule
+
+from rtgs.errors import RtgsError
+from rtgs.evaluate.boundary import boundary_scores
+from rtgs.gaussians.density import logit
+from rtgs.methods import RenderOptions, Stage, create_method, method_stages
+from rtgs.methods.interface_set import normal_quaternions
+from rtgs.methods.transmittance_set import random_surfels
+from rtgs.train.seeds import generator_for
+from rtgs.train.settings import MethodSettings, TransmittanceSettings
+from rtgs.train.specular_settings import InterfaceSettings
+from rtgs.train.trainer import Trainer
+
+LAYERS = RenderOptions(layers=True)
+
+
+@pytest.fixture(scope="module")
+def made() -> GlassScene:
+    return glass_scene()
+
+
+def test_three_stages_where_there_is_something_transparent(made: GlassScene):
+    settings, plan = glass_recipe(), schedule()
+    names = [(stage.name, stage.from_step, stage.until) for stage in method_stages(settings, plan, transparent=True)]
+    assert names == [("diffuse", 0, 15), ("reflection", 15, 30), ("transmittance", 30, 60)]
+    without = [(stage.name, stage.until) for stage in method_stages(settings, plan)]
+    assert without == [("diffuse", 15), ("reflection", 60)]
+    off = replace(settings, transmittance=replace(settings.transmittance, enabled=False))
+    assert method_stages(off, plan, transparent=True) == method_stages(settings, plan)
+    early = replace(settings, transmittance=replace(settings.transmittance, start=0.2))
+    with pytest.raises(ValueError, match=r"method.transmittance.start=0.2 is step 12 of 60, but the reflection stage"):
+        method_stages(early, plan, transparent=True)
+    with pytest.raises(ValueError, match="envgs has no stage that takes an object mesh"):
+        create_method(replace(settings, name="envgs"), made.scene, plan, generator_for(0, "initialise"), made.mesh)
+    with pytest.raises(RtgsError, match="run extract_mesh before it"):
+        new_glass_method(settings, made, mesh=False).begin(Stage("transmittance", 30, 60))
+
+
+def test_the_base_set_is_split_by_the_mesh(made: GlassScene):
+    method = new_glass_method(glass_recipe(), made)
+    for stage in method.stages[:2]:
+        method.begin(stage)
+    before = method.base.surfels.means.detach().clone()
+    method.base.density.observe(torch.ones(len(before), 2), torch.ones(len(before)))
+    method.begin(method.stages[2])
+    assert method.transmittance is not None
+    assert method.interface is not None
+    own = method.transmittance.surfels.means.detach()
+    assert len(own) + len(method.base) == len(before)
+    assert len(own) >= 60
+    distance = (own - torch.tensor([0.0, 0.0, -0.2])).norm(dim=1)
+    assert float(distance.max()) < 0.6 + 0.05
+    rest = (method.base.surfels.means.detach() - torch.tensor([0.0, 0.0, -0.2])).norm(dim=1)
+    assert float(rest.min()) > 0.55
+    for tensors in (method.base.optimizer.first.means, method.base.density.signal_sum):
+        assert len(tensors) == len(method.base)
+    points = method.interface.surfels.means.detach() - torch.tensor([0.0, 0.0, -0.2])
+    assert float((points.norm(dim=1) - 0.6).abs().max()) < 0.03
+    assert float(method.interface.surfels.opacity_logits.detach().sigmoid().min()) == pytest.approx(0.95)
+
+
+def test_quaternions_turn_the_third_axis_to_the_normal():
+    normals = torch.nn.functional.normalize(torch.randn(50, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    normals = torch.cat((normals, torch.tensor([[0, 0, 1.0], [0, 0, -1.0]])))
+    w, x, y, z = torch.nn.functional.normalize(normal_quaternions(normals), dim=1).unbind(1)
+    third = torch.stack((2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)), dim=1)
+    torch.testing.assert_close(third, normals, atol=1e-5, rtol=0)
+
+
+def test_a_random_set_is_shrunk_until_rays_meet_few_of_it():
+    generator = torch.Generator().manual_seed(0)
+    box = torch.tensor([[-1.0, -1, -1], [1, 1, 1]])
+    counts = []
+    for most in (1e9, 5.0):
+        settings = TransmittanceSettings(cells=6, most_hits=most)
+        surfels = random_surfels(settings, box, generator)
+        radius = surfels.log_scales.detach().exp()[:, 0] * (2 * torch.tensor(0.1 * 255).log()).sqrt()
+        counts.append(float((torch.pi * radius.square() / 2).sum() / 6))  # a cube of side 2 shows 6 on average
+    assert counts[0] > 10
+    assert counts[1] == pytest.approx(5.0, rel=1e-4)
+
+
+def test_image_is_the_sum_of_its_layers_and_only_masks_are_seen_through(made: GlassScene):
+    method = begun(glass_recipe(), made)
+    view = made.scene.test[0]
+    with torch.no_grad():
+        shown = method.render(view.camera, 40, LAYERS, view.mask)
+    layers, inside = shown.layers, shown.transparent
+    assert layers is not None
+    assert layers.transmission is not None
+    assert inside is not None
+    total = layers.diffuse * (1 - layers.specular * layers.traced) + layers.reflection + layers.transmission
+    torch.testing.assert_close(shown.image, total, atol=1e-5, rtol=1e-5)
+    assert float(layers.transmission[:, ~inside].abs().max()) == 0
+    assert float(layers.transmission[:, inside].mean()) > 0.01
+    assert method.guide is not None
+    assert torch.equal(inside, method.guide.surfaces(view.camera).hit)
+    assert view.mask is not None
+    given = method.render(view.camera, 40, RenderOptions(masks="given"), view.mask).transparent
+    assert given is not None
+    assert torch.equal(given, view.mask & inside)
+
+
+def test_without_a_mask_in_the_picture_the_second_stage_is_shown(made: GlassScene):
+    """No pixel of the object: the very image of a method that stopped before, to the bit."""
+    settings = glass_recipe(interface=InterfaceSettings(count=0), split=False)
+    third, second = begun(settings, made), new_glass_method(settings, made, mesh=False)
+    for stage in second.stages:
+        second.begin(stage)
+    view = made.scene.train[0]
+    assert view.mask is not None
+    nothing = torch.zeros_like(view.mask)
+    assert torch.equal(third.render(view.camera, 40, None, nothing).image, second.render(view.camera, 40).image)
+    covered = torch.ones_like(nothing)
+    everywhere = third.render(view.camera, 40, None, covered)
+    assert bool(torch.isfinite(everywhere.image).all())
+    assert everywhere.transparent is not None
+    assert bool(everywhere.transparent.all())
+    everywhere.image.sum().backward()
+    unmasked = third.render(view.camera, 40, None, None).transparent  # the silhouette: the object is there all the same
+    assert third.guide is not None
+    assert unmasked is not None
+    assert torch.equal(unmasked, third.guide.surfaces(view.camera).hit)
+
+
+def test_empty_masks_leave_the_stage_out_and_say_so():
+    made = glass_scene()
+    views = tuple(replace(view, mask=torch.zeros_like(view.mask)) for view in made.scene.train)  # type: ignore[arg-type]
+    empty = GlassScene(replace(made.scene, train=views), made.mesh)
+    method = begun(glass_recipe(), empty)
+    assert [part.name for part in method.sets] == ["base", "reflection"]
+    assert method.decisions[-1].what == "no transmittance stage"
+    assert method.decisions[-1].why == "the masks of the training views are empty"
+    view = made.scene.test[0]
+    assert method.render(view.camera, 40, LAYERS, view.mask).transparent is None
+
+
+def test_a_pane_has_no_second_bounce_and_a_set_behind_it():
+    made = glass_scene()
+    flat = GlassScene(made.scene, ball_mesh(flat=True))
+    method = begun(glass_recipe(), flat)
+    assert method.transmittance is not None
+    assert len(method.transmittance) == 3**3 * 4  # nothing is inside a pane: random ones in its box
+    view = made.scene.train[0]
+    with torch.no_grad():
+        method.transmittance.surfels.opacity_logits.fill_(-13)
+        layers = method.render(view.camera, 40, LAYERS, view.mask).layers
+    assert layers is not None
+    assert layers.transmission is not None
+    assert float(layers.transmission.abs().max()) == 0
+
+
+def test_every_parameter_learns_and_nothing_resets_the_base(made: GlassScene):
+    method = new_glass_method(glass_recipe(), made)
+    train_stages(method, made.scene)
+    assert {part.name for part in method.sets} == {"base", "reflection", "transmittance", "interface"}
+    interface = method.interface
+    assert interface is not None
+    assert float(interface.surfels.opacity_logits.detach().min()) >= logit(0.9) - 1e-6
+    assert int(method.base.surfels.means.shape[0]) > 0
+    for part in method.sets:
+        for name, moment in part.optimizer.second.items():
+            assert float(moment.max()) > 0, f"{part.name}.{name}"
+    events = [event for step in range(30, 59) for event in _events_of(method, step)]
+    assert not [event for event in events if event.set_name == "base"]
+
+
+def _events_of(method, step: int):
+    """What the plan asks of the sets before ``step + 1``, without training."""
+    for part in method.sets:
+        part.optimizer.zero_grad()
+    return method.after_step(step)
+
+
+def test_a_killed_stage_goes_on_bit_for_bit(made: GlassScene, tmp_path: Path):
+    settings = glass_recipe()
+    whole = new_glass_method(settings, made)
+    train_stages(whole, made.scene, folder=tmp_path / "whole")
+    halves = new_glass_method(settings, made)
+    train_stages(halves, made.scene, folder=tmp_path / "halves")
+    for step in (60, 50):  # as if killed after step 40: what came later is gone
+        folder = tmp_path / "halves" / f"step_{step:08d}"
+        if step == 60:
+            (folder / "record.json").unlink()
+    stage = whole.stages[-1]
+    resumed = new_glass_method(settings, made)
+    summary = Trainer(resumed, made.scene, seed=3, stage=stage, checkpoint_dir=tmp_path / "halves").run()
+    assert summary.resumed_from == 50
+    first, second = whole.state(), resumed.state()
+    assert first.keys() == second.keys()
+    assert "third_stage" in first
+    for name, tensor in first.items():
+        assert torch.equal(tensor, second[name]), name
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"first_bounce": "base"},
+        {"first_bounce": "none"},
+        {"second_bounce": "none", "normal": "mesh"},
+        {"second_bounce": "first_bounce", "freeze_base": False},
+        {"compositing": "sum", "box": "scene", "split": False, "test_masks": "given"},
+        {"first_bounce_end": "clip", "second_bounce_gradient": False, "second_offset": 0.0},
+    ],
+)
+def test_every_choice_trains(made: GlassScene, changes: dict[str, object]):
+    method = new_glass_method(glass_recipe(**changes), made, schedule(total=24, checkpoint_every=100))
+    train_stages(method, made.scene)
+    for part in method.sets:
+        for name, tensor in part.surfels.items():
+            assert bool(torch.isfinite(tensor).all()), f"{part.name}.{name}"
+    view = made.scene.test[0]
+    again = new_glass_method(glass_recipe(**changes), made, schedule(total=24, checkpoint_every=100))
+    again.load({name: tensor.clone() for name, tensor in method.state().items()})
+    with torch.no_grad():
+        images = [m.render(view.camera, 24, RenderOptions(), view.mask).image for m in (method, again)]
+    assert torch.equal(*images)
+
+
+def test_wild_learning_rates_stay_finite(made: GlassScene):
+    settings = glass_recipe()
+    wild = replace(
+        settings.optimizer, means_initial=0.05, log_scales=0.5, opacity_logits=2.0, quaternions=1.0, sh_dc=1.0
+    )
+    method = new_glass_method(replace(settings, optimizer=wild), made, schedule(total=40, checkpoint_every=100))
+    train_stages(method, made.scene)
+    view = made.scene.test[0]
+    with torch.no_grad():
+        assert bool(torch.isfinite(method.render(view.camera, 40, RenderOptions(), view.mask).image).all())
+
+
+def test_what_an_earlier_stage_does_not_read_is_blank():
+    from rtgs.methods import stage_settings
+
+    plain = MethodSettings(name="rtgs")
+    other = replace(
+        plain,
+        transmittance=replace(plain.transmittance, first_bounce="base", enabled=False),
+        loss=replace(plain.loss, specular=0.5, transmission_depth=0.3),
+    )
+    for stage in ("diffuse", "reflection"):
+        assert stage_settings(other, stage) == stage_settings(plain, stage)
+        once = stage_settings(other, stage)
+        assert stage_settings(once, stage) == once
+        assert stage_settings(stage_settings(other, "reflection"), "diffuse") == stage_settings(other, "diffuse")
+    assert stage_settings(other, "transmittance") == other
+    early = replace(plain, loss=replace(plain.loss, specular=0.2, specular_start=0.05))
+    assert stage_settings(early, "reflection").loss.specular == 0.2
+    assert stage_settings(stage_settings(early, "reflection"), "reflection") == stage_settings(early, "reflection")
+
+
+def test_the_boundary_is_measured(made: GlassScene):
+    method = begun(glass_recipe(), made)
+    scores = boundary_scores(method, made.scene, made.mesh, 40)
+    assert scores.silhouette_iou is not None
+    assert scores.silhouette_iou > 0.7  # of a 24x18 picture
+    assert scores.depth_share is None  # no truth in this scene
+    assert scores.specular is not None
+    assert 0 < scores.specular < 1
+    assert "silhouettes IoU" in str(scores)

@@ -1,0 +1,162 @@
+"""Three training stages through the command line: which scenes get the third, and what the rows of Table 3 share."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from test_app import QUICK, _in_root, root  # noqa: F401  (fixtures)
+
+from pipelines.cli import main
+from pipelines.graph import build_graph
+from pipelines.train_transmittance import BOUNDARY_FILE
+from pipelines.training import OBJECT_FOLDER, load_method, stage_params
+from rtgs.config import compose
+from rtgs.config.locate import conf_dir
+from rtgs.mesh.container import read_object_mesh
+from rtgs.methods.transmittance import TransmissiveMethod
+from rtgs.pipeline.manifest import Manifest
+from rtgs.scenes.canonical import read_scene
+
+WIDTH, HEIGHT, VIEWS = 32, 24, 14
+ROWS = ("none", "no_transmittance_gaussians", "no_specular_loss", "no_depth_loss", "no_mesh_guide")
+TINY = (
+    "method.reflection.cells=3",
+    "method.transmittance.cells=3",
+    "method.transmittance.interface.count=200",
+    "method.loss.perceptual=0",
+    "evaluation.lpips=false",
+)
+RADIUS, DISTANCE, FOCAL = 0.7, 3.0, 30.0
+
+
+def pose(index: int) -> list[list[float]]:
+    """Camera to world (OpenGL axes) around the origin, at three heights."""
+    angle, height = 2 * math.pi * index / VIEWS, (-0.5, 0.2, 0.9)[index % 3]
+    backward = np.array([math.cos(angle), height, math.sin(angle)])
+    backward /= np.linalg.norm(backward)
+    right = np.cross([0.0, 1.0, 0.0], backward)
+    right /= np.linalg.norm(right)
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.stack([right, np.cross(backward, right), backward], axis=1)
+    matrix[:3, 3] = DISTANCE * backward
+    return matrix.tolist()
+
+
+def write_capture(folder: Path, masks: str) -> Path:
+    """Pictures of a ball; ``masks``: "ball", "empty" or "none"."""
+    (folder / "images").mkdir(parents=True)
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH]
+    apparent = FOCAL * RADIUS / math.sqrt(DISTANCE**2 - RADIUS**2)
+    ball = (x + 0.5 - WIDTH / 2) ** 2 + (y + 0.5 - HEIGHT / 2) ** 2 < apparent**2
+    frames = []
+    for index in range(VIEWS):
+        picture = np.stack([128 + 90 * np.sin(x / 5 + index), 128 + 90 * np.cos(y / 4), 100 + x], axis=-1)
+        picture[ball] = 0.5 * picture[ball] + 60
+        Image.fromarray(picture.clip(0, 255).astype(np.uint8)).save(folder / "images" / f"{index:03d}.png")
+        if masks != "none":
+            (folder / "masks").mkdir(exist_ok=True)
+            mask = (ball if masks == "ball" else np.zeros_like(ball)).astype(np.uint8) * 255
+            Image.fromarray(mask).save(folder / "masks" / f"{index:03d}.png")
+        frames.append({"file_path": f"images/{index:03d}.png", "transform_matrix": pose(index)})
+    shared = {"w": WIDTH, "h": HEIGHT, "fl_x": FOCAL, "fl_y": FOCAL, "cx": 16.0, "cy": 12.0, "camera_model": "PINHOLE"}
+    (folder / "transforms.json").write_text(json.dumps(shared | {"frames": frames}))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def glass(tmp_path_factory) -> Path:
+    return write_capture(tmp_path_factory.mktemp("captures") / "glass ball", "ball")
+
+
+def graph_of(capture: Path, *words: str):
+    config, choices = compose(["scene=capture", f"scene.path={capture}", "method=rtgs", *QUICK, *TINY, *words])
+    return build_graph(config, choices)
+
+
+def test_only_scenes_with_masks_that_show_something_get_the_third_stage(glass: Path, tmp_path: Path):
+    full = graph_of(glass)
+    assert [step.name for step in full.training] == ["train_diffuse", "train_reflection", "train_transmittance"]
+    assert full.mesh is not None
+    assert [step.name for step in full.mesh.upstream] == ["import_scene", "train_diffuse", "train_reflection"]
+    assert full.mesh in full.training[-1].upstream
+    for masks, why in (("none", "no masks of transparent objects"), ("empty", "all 14 masks of the scene are empty")):
+        without = graph_of(write_capture(tmp_path / masks, masks))
+        assert [step.name for step in without.training] == ["train_diffuse", "train_reflection"]
+        assert without.mesh is None
+        assert without.training[-1].params.until == 12
+        assert any(step.name == "train_transmittance" and why in step.why for step in without.skipped)
+    two = graph_of(glass, "ablation=two_stages")
+    assert [step.name for step in two.training] == ["train_diffuse", "train_reflection"]
+    assert two.training[-1].params.until == 12
+    assert not any(step.name == "train_transmittance" for step in graph_of(glass, "method=2dgs").skipped)
+
+
+def test_the_rows_of_table_3_share_everything_before_the_third_stage(glass: Path):
+    swept = (conf_dir() / "experiment" / "table3.yaml").read_text()
+    assert ",".join(ROWS) in swept
+    prints: dict[str, set[str]] = {}
+    for row in (*ROWS, "paper_glass"):
+        graph = graph_of(glass, f"ablation={row}")
+        assert graph.mesh is not None
+        for step in (*graph.training, graph.mesh):
+            prints.setdefault(step.name, set()).add(step.fingerprint)
+    assert {name: len(found) for name, found in prints.items()} == {
+        "train_diffuse": 1,
+        "train_reflection": 1,
+        "extract_mesh": 1,
+        "train_transmittance": len(ROWS) + 1,
+    }
+    other = graph_of(glass, "ablation=mesh_tsdf")
+    assert other.mesh is not None
+    assert other.mesh.fingerprint not in prints["extract_mesh"]
+    assert other.training[1].fingerprint in prints["train_reflection"]
+
+
+def test_a_table_3_runs_each_shared_step_once_and_nothing_twice(root: Path, glass: Path, capsys):  # noqa: F811
+    words = ["run", f"scene={glass}", "method=rtgs", *QUICK, *TINY, "--multirun", f"ablation={','.join(ROWS)}"]
+    assert main(words) == 0
+    store = root / "store"
+
+    def made(step: str) -> list[Path]:
+        return [path.parent for path in (store / step).glob("*/*/manifest.json")]
+
+    counts = {name: len(made(name)) for name in ("train_diffuse", "train_reflection", "extract_mesh")}
+    assert counts == {"train_diffuse": 1, "train_reflection": 1, "extract_mesh": 1}
+    third = made("train_transmittance")
+    assert len(third) == len(ROWS)
+    capsys.readouterr()
+    before = {path: (path / "manifest.json").stat().st_mtime_ns for path in third}
+    assert main(words) == 0
+    assert before == {path: (path / "manifest.json").stat().st_mtime_ns for path in made("train_transmittance")}
+    _artifacts_are_complete(store, third)
+    page = (root / "runs" / "glass_ball-rtgs-smoke" / "report.html").read_text()
+    assert "Transmission" in page
+    assert "surface before the third stage" in page
+    table = json.loads((root / "runs" / "glass_ball-rtgs-smoke" / "metrics.json").read_text())
+    assert table["mean"]["psnr_masked"] is not None
+    assert table["mean"]["psnr_masked_given_masks"] is not None
+
+
+def _artifacts_are_complete(store: Path, third: list[Path]) -> None:
+    """Each carries the mesh, the scores at the boundary, and everything a renderer needs."""
+    (scene_folder,) = [path.parent for path in (store / "import_scene").glob("*/*/manifest.json")]
+    scene = read_scene(scene_folder)
+    for folder in third:
+        assert Manifest.read(folder) is not None
+        assert len(read_object_mesh(folder / OBJECT_FOLDER).mesh.faces) > 0
+        assert set(json.loads((folder / BOUNDARY_FILE).read_text())) == {"before", "after"}
+        method, params = load_method(folder, scene)
+        assert isinstance(method, TransmissiveMethod)
+        assert stage_params(folder).stage == "transmittance"
+        assert (method.transmittance is None) == (params.method.transmittance.first_bounce == "base")
+        with torch.no_grad():
+            view = scene.test[0]
+            rendered = method.render(view.camera, params.until, None, view.mask)
+        assert rendered.transparent is not None
+        assert bool(torch.isfinite(rendered.image).all())
