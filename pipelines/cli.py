@@ -20,7 +20,7 @@ USAGE = f"""rtgs {__version__}: Gaussian models of scenes with glass and mirrors
   rtgs run [group=choice] [key=value]     train, render, measure, report; what is cached is not run again
   rtgs run synthesize scene=NAME|all      path-trace a described scene into a capture with known truth
   rtgs plan [--multirun] [key=value]      what `rtgs run` with the same words would do, and why
-  rtgs check FOLDER | scene=NAME          what is wrong with a capture, before any training
+  rtgs check FOLDER | scene=NAME | data=  what is wrong with a capture, before any training
   rtgs report [RUN]                       where the report of the latest (or the named) run is
   rtgs show FILE.ply [--scene NAME]       pictures of any Gaussian splat; with a scene, measured on its test views
   rtgs cache ls|gc|verify|push|pull       the artifact store, and the one that machines share
@@ -143,9 +143,16 @@ def cache(words: list[str]) -> int:
 def check(words: list[str]) -> int:
     """``rtgs check``: everything wrong with a capture; exit code 1 when it cannot be trained on."""
     if not words or words[0] in ("-h", "--help"):
-        print("rtgs check FOLDER | scene=NAME [scene.key=value]\n")
-        print("Lists what is wrong with a capture; reads every photo, mask and normal map.")
+        print("rtgs check FOLDER | scene=NAME [scene.key=value] | data=ref_real | data=nu_nerf\n")
+        print(
+            "Lists what is wrong with a capture; reads every photo, mask and normal map. data: which scenes of a paper"
+        )
+        print("are in DATA_ROOT, and where what is missing belongs.")
         return 0 if words else 2
+    if words[0].startswith("data="):
+        from pipelines.datasets import check_dataset
+
+        return check_dataset(words[0].removeprefix("data="))
     from pipelines.app import friendly_overrides
     from rtgs.config import compose
     from rtgs.prepare.source import check_source

@@ -77,7 +77,7 @@ class Cell:
     scene: str
     values: Mapping[str, Value | None]  # by metric key
     ranks: Mapping[str, int]  # 1, 2, 3 by metric key, where earned
-    paper: PaperScore | None
+    paper: PaperScore | None  # on the paper's own data; never beside stand-ins
     seeds: tuple[int, ...]
     preset: str
     resolution: str
@@ -159,6 +159,6 @@ def _cell(
     spec: TableSpec,
 ) -> Cell:
     first = group[0].evaluation
-    paper = PAPER_SCORES.get((key[0], group[0].paper_scene)) if spec.data != OWN_DATA else None
+    paper = PAPER_SCORES.get((key[0], group[0].paper_scene)) if spec.data == PAPER_DATA else None
     seeds = tuple(sorted(run.seed for run in group))
     return Cell(*key, values, ranks, paper, seeds, first.facts.preset, first.resolution, len(first.rows))

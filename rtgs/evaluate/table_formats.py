@@ -1,7 +1,7 @@
 """A paper's table as Markdown, CSV, LaTeX and HTML.
 
-The paper's own figures stand in columns of their own. A difference is formed only where the data are the paper's;
-beside stand-ins they are shown for orientation and said to be not comparable.
+The paper's own figures and the differences to them stand in columns of their own, which exist only where the data are
+the paper's: beside stand-ins they would invite a comparison that means nothing.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ def notes(table: PaperTable) -> tuple[str, ...]:
     found = [f"Preset {', '.join(presets)}; {', '.join(sizes)}; {cells[0].views} test views."]
     if table.spec.data == STAND_IN:
         found.append(
-            "The scenes are path-traced stand-ins named after the paper's: its figures, where shown, are for "
-            "other data and not comparable."
+            "The scenes are path-traced stand-ins named after the paper's: its figures are for other data and not "
+            "comparable, so they are not shown."
         )
     if max(seeds) > 1:
         found.append(f"Mean ± sample standard deviation over {max(seeds)} seeds; smaller differences are noise.")
@@ -89,7 +89,7 @@ def _rows(
 
 
 def _paper_rows(table: PaperTable) -> list[list[str]]:
-    """The paper's figures and, on the paper's data, ours minus theirs."""
+    """The paper's figures and ours minus theirs; none where the data are not the paper's."""
     rows = []
     for method in table.methods:
         cells = [table.cell(method, scene) for scene in table.scenes]
@@ -99,9 +99,8 @@ def _paper_rows(table: PaperTable) -> list[list[str]]:
         for cell in cells:
             paper = None if cell is None else cell.paper
             row.append("" if paper is None else f"{paper.psnr:.2f} / {paper.ssim:.3f} / {paper.lpips:.3f}")
-            if table.spec.data == PAPER_DATA:
-                ours = None if cell is None else cell.values["psnr"]
-                row.append("" if paper is None or ours is None else f"{ours.mean - paper.psnr:+.2f}")
+            ours = None if cell is None else cell.values["psnr"]
+            row.append("" if paper is None or ours is None else f"{ours.mean - paper.psnr:+.2f}")
         rows.append(row)
     return rows
 
@@ -109,9 +108,7 @@ def _paper_rows(table: PaperTable) -> list[list[str]]:
 def _paper_header(table: PaperTable) -> list[str]:
     header = ["method"]
     for scene in table.scenes:
-        header.append(f"{scene}: paper's PSNR / SSIM / LPIPS")
-        if table.spec.data == PAPER_DATA:
-            header.append(f"{scene}: PSNR, ours - paper's")
+        header += [f"{scene}: paper's PSNR / SSIM / LPIPS", f"{scene}: PSNR, ours - paper's"]
     return header
 
 
@@ -130,9 +127,7 @@ def _blocks(
         ("Inside the mask, and what it cost", _header(table, costs), _rows(table, costs, marks, pm)),
     ]
     if paper := _paper_rows(table):
-        same = table.spec.data == PAPER_DATA
-        heading = "The paper's figures" if same else "The paper's figures, on its own data: not comparable"
-        blocks.append((heading, _paper_header(table), paper))
+        blocks.append(("The paper's figures", _paper_header(table), paper))
     return blocks
 
 
@@ -161,14 +156,17 @@ def _escaped_pipe(text: str) -> str:
     return text.replace("|", "\\|")
 
 
+_PAPER_COLUMNS = ("paper_psnr", "paper_ssim", "paper_lpips", "psnr_minus_paper")
+
+
 def comma_separated(table: PaperTable) -> str:
     """One row per method and scene with everything, unrounded: for other programs."""
     metrics = (*QUALITY, *COSTS)
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     head = ["table", "data", "scene", "method", "preset", "resolution", "views", "seeds"]
-    head += [f"{m.key}{part}" for m in metrics for part in ("", "_std")]
-    writer.writerow([*head, "paper_psnr", "paper_ssim", "paper_lpips", "psnr_minus_paper"])
+    head += [f"{m.key}{part}" for m in metrics for part in ("", "_std", "_rank")]
+    writer.writerow([*head, *(_PAPER_COLUMNS if table.spec.data == PAPER_DATA else ())])
     for scene in table.scenes:
         for method in table.methods:
             if cell := table.cell(method, scene):
@@ -182,10 +180,12 @@ def _csv_row(spec: TableSpec, cell: Cell, metrics: Sequence[Metric]) -> list[obj
     for metric in metrics:
         value = cell.values[metric.key]
         row += ["", ""] if value is None else [repr(value.mean), "" if value.spread is None else repr(value.spread)]
+        row.append(cell.ranks.get(metric.key, ""))
+    if spec.data != PAPER_DATA:
+        return row
     paper, ours = cell.paper, cell.values["psnr"]
     row += ["", "", ""] if paper is None else [paper.psnr, paper.ssim, paper.lpips]
-    comparable = paper is not None and ours is not None and spec.data == PAPER_DATA
-    row.append(repr(ours.mean - paper.psnr) if comparable else "")  # pyright: ignore[reportOptionalMemberAccess]
+    row.append("" if paper is None or ours is None else repr(ours.mean - paper.psnr))
     return row
 
 

@@ -51,12 +51,45 @@ def test_seeds_give_mean_and_sample_deviation():
     assert "over 3 seeds" in page(table)
 
 
-def test_stand_ins_are_shown_beside_the_paper_and_never_subtracted():
-    text = markdown(build_table(STAND_IN, [run("rtgs", "ball_statue", 30.0), run("envgs", "ball_statue", 29.0)]))
-    assert "26.05 / 0.885 / 0.174" in text
-    assert "not comparable" in text
-    assert "ours - paper's" not in text
-    assert "+3.95" not in text
+@pytest.mark.parametrize("data", ["stand_in", "own"])
+def test_the_papers_columns_exist_only_on_the_papers_data(tmp_path, data):
+    """The scenes are even called like the paper's: what decides is whose data they are."""
+    runs = [run("rtgs", "sedan", 30.0), run("envgs", "ball_statue", 29.0)]
+    texts = {
+        path.suffix: path.read_text() for path in write_table(tmp_path, build_table(TableSpec("t", "T", data), runs))
+    }
+    for text in texts.values():
+        for trace in ("26.2", "25.5", "0.728", "ours - paper", "minus_paper", "paper_psnr", "The paper's figures"):
+            assert trace not in text
+    if data == "stand_in":
+        assert "not comparable" in texts[".md"]
+    same = {
+        path.suffix: path.read_text() for path in write_table(tmp_path, build_table(TableSpec("t", "T", "paper"), runs))
+    }
+    assert "26.20 / 0.728 / 0.298" in same[".md"]
+    assert "| +3.80 |" in same[".md"]
+    assert "& +3.80" in same[".tex"]
+    assert "<td>+3.80" in same[".html"]
+    sedan = next(row for row in csv.DictReader(io.StringIO(same[".csv"])) if row["scene"] == "sedan")
+    assert (float(sedan["paper_psnr"]), float(sedan["psnr_minus_paper"])) == (26.203, pytest.approx(3.797))
+
+
+def test_first_second_and_third_are_marked_in_every_format(tmp_path):
+    runs = [
+        run(method, "a", psnr) for method, psnr in (("2dgs", 25.0), ("3dgs", 26.0), ("envgs", 27.0), ("rtgs", 28.0))
+    ]
+    texts = {path.suffix: path.read_text() for path in write_table(tmp_path, build_table(STAND_IN, runs))}
+    marks = {
+        ".md": ("**28.00**", "<u>27.00</u>", "*26.00*"),
+        ".tex": (r"\textbf{28.00}", r"\underline{27.00}", r"\textit{26.00}"),
+        ".html": ("<b class=first>28.00</b>", "<b class=second>27.00</b>", "<b class=third>26.00</b>"),
+    }
+    for suffix, three in marks.items():
+        for mark in three:
+            assert texts[suffix].count(mark) == 1
+        assert texts[suffix].count("25.00") == 1
+    ranks = {row["method"]: row["psnr_rank"] for row in csv.DictReader(io.StringIO(texts[".csv"]))}
+    assert ranks == {"rtgs": "1", "envgs": "2", "3dgs": "3", "2dgs": ""}
 
 
 def test_on_the_papers_data_the_difference_has_its_own_column():

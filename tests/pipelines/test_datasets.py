@@ -1,0 +1,146 @@
+"""The papers' datasets on small folders of their exact structure, and on folders that lack something."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipelines.cli import main
+from pipelines.datasets import TITLES, VIEWS, dataset_states
+from pipelines.graph import build_graph
+from rtgs.config import compose
+from rtgs.config.locate import choices_of, project_root
+from rtgs.config.sweep import compose_jobs
+from rtgs.scenes.scene import load_scene
+from tests.scenes.captures import ColmapCapture, save_image
+
+VIEW_COUNT = 9
+SIZE = (64, 48)
+NU_NERF = {"ballstatue": 1080, "popcorncup_all": 1080, "real_bottle": 720, "tall_bottle": 1080}  # methods.md 8.2
+REF_REAL = ("sedan", "gardenspheres", "toycar")  # methods.md 8.1
+
+
+@pytest.fixture(scope="module")
+def data_root(tmp_path_factory) -> Path:
+    """Both datasets as they are downloaded, with tiny photos: shrunk copies beside the full ones, masks."""
+    root = tmp_path_factory.mktemp("data")
+    for scene in REF_REAL:
+        folder = ColmapCapture(root / "ref_real" / scene, VIEW_COUNT).write()
+        for size in (4, 8):  # the shrunk copies that come along are not to be read
+            for photo in (folder / "images").iterdir():
+                save_image(folder / f"images_{size}" / photo.name, np.zeros((SIZE[1] // size, SIZE[0] // size, 3)))
+        (folder / "poses_bounds.npy").write_bytes(b"of LLFF, not read")
+    for scene, size in NU_NERF.items():
+        folder = root / "nu_nerf" / scene
+        lens = {"model": "SIMPLE_RADIAL", "params": (60.0, 32.0, 24.0, 0.02)}
+        ColmapCapture(folder, VIEW_COUNT, folder="colmap/sparse/0", images_dir=f"images_{size}", **lens).write()
+        (folder / "meta_info.txt").write_text("0 0 1\n0 1 0\n")
+        (folder / "cache.pkl").write_bytes(b"of NU-NeRF, not read")
+        mask = np.zeros((SIZE[1], SIZE[0]), dtype=np.uint8)
+        mask[20:30, 20:40] = 255
+        for photo in (folder / f"images_{size}").iterdir():
+            save_image(folder / "mask_erosion" / f"{photo.stem}.png", mask)
+    return root
+
+
+@pytest.fixture
+def root(data_root, tmp_path, monkeypatch) -> Path:
+    """A copy that a test may spoil."""
+    shutil.copytree(data_root, tmp_path / "data")
+    monkeypatch.setenv("DATA_ROOT", str(tmp_path / "data"))
+    monkeypatch.setenv("RTGS_ROOT", str(tmp_path))
+    return tmp_path / "data"
+
+
+def test_every_scene_of_the_papers_imports_at_its_size_and_split(root):
+    for scene in REF_REAL:
+        loaded = load_scene(compose([f"scene=ref_real/{scene}", "preset=paper"])[0].scene)
+        sizes = {(view.camera.width, view.camera.height) for view in (*loaded.train, *loaded.test)}
+        assert sizes == {(16, 12)}  # a quarter of the full photo, not images_4
+        assert max(view.image.max() for view in loaded.train) > 0.5
+        assert [view.name for view in loaded.test] == ["photo_00.png", "photo_08.png"]
+    for scene in (choice for choice in choices_of("scene") if choice.startswith("nu_nerf/")):
+        loaded = load_scene(compose([f"scene={scene}", "preset=paper"])[0].scene)
+        view = loaded.train[0]
+        assert abs(view.camera.width - SIZE[0]) <= 4  # whole photos, undistorted
+        assert view.mask is not None
+        assert 0.02 < view.mask.float().mean() < 0.2
+        assert len(loaded.test) == 2
+
+
+@pytest.mark.parametrize("data", sorted(TITLES))
+def test_the_tables_run_on_the_papers_data(root, data):
+    """What `make reproduce-table* DATA=...` passes on composes and has a graph."""
+    table = {"ref_real": "table1", "nu_nerf": "table2"}[data]
+    shown = subprocess.run(
+        ["make", "-n", f"reproduce-{table}", f"DATA={data}", "PRESET=smoke"],
+        cwd=project_root(),
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    check, run = shown.stdout.splitlines()[-2:]
+    assert check.endswith(f"rtgs check data={data}")
+    jobs, sweep = compose_jobs([*run.split("rtgs run ")[1].split(), "method=2dgs"], multirun=False)
+    assert sweep
+    assert {job.choices.scene_file for job in jobs if job.choices} == {state.choice for state in dataset_states(data)}
+    for job in jobs:
+        assert job.config is not None
+        assert job.choices is not None
+        assert job.config.table.data == "paper"
+        build_graph(job.config, job.choices)
+
+
+def test_complete_datasets_are_ready(root, monkeypatch, capsys):
+    monkeypatch.setattr("pipelines.datasets.VIEWS", dict.fromkeys(VIEWS, VIEW_COUNT))
+    for data in TITLES:
+        assert main(["check", f"data={data}"]) == 0
+        shown = capsys.readouterr().out
+        assert shown.count("ready, 9 photos") == len(dataset_states(data))
+        assert "remark" not in shown
+
+
+def test_other_numbers_of_photos_than_the_papers_are_told(root, capsys):
+    assert main(["check", "data=ref_real"]) == 0
+    assert "9 photos where the papers have 158: figures are not comparable" in capsys.readouterr().out
+
+
+def test_what_is_missing_is_listed_with_where_it_belongs(root, capsys):
+    ref, nu = root / "ref_real", root / "nu_nerf"
+    (ref / "sedan" / "sparse" / "0" / "points3D.bin").unlink()
+    shutil.rmtree(ref / "toycar" / "images")
+    (ref / "gardenspheres" / "images" / "photo_03.png").unlink()
+    (nu / "ballstatue" / "colmap" / "sparse").rename(nu / "ballstatue" / "sparse")  # one level too high
+    (nu / "real_bottle" / "images_720").rename(nu / "real_bottle" / "images_1080")
+    shutil.rmtree(nu / "popcorncup_all")
+    shutil.rmtree(nu / "tall_bottle" / "mask_erosion")
+
+    assert main(["check", "data=ref_real"]) == 1
+    lines = [line.strip() for line in capsys.readouterr().out.splitlines()]
+    assert str(ref / "sedan/sparse/0/points3D.bin") in lines
+    others = "there is images_4, images_8: another size, whose figures are others"
+    assert f"{ref / 'toycar/images'}/ with the photos ({others})" in lines
+    assert str(ref / "gardenspheres/images/photo_03.png") in lines
+    assert lines[-1] == "0 of 3 scenes are ready"
+
+    assert main(["check", "data=nu_nerf"]) == 1
+    lines = [line.strip() for line in capsys.readouterr().out.splitlines()]
+    model = nu / "ballstatue" / "colmap" / "sparse" / "0"
+    for part in ("cameras", "images", "points3D"):
+        assert f"{model / part}.bin (there is a model in sparse/0/: move it)" in lines
+    assert any(
+        line.startswith(f"{nu / 'real_bottle/images_720'}/ with the photos (there is images_1080") for line in lines
+    )
+    assert f"{nu / 'popcorncup_all/colmap/sparse/0/cameras.bin'}" in lines
+    assert f"{nu / 'popcorncup_all/images_1080'}/ with the photos" in lines
+    assert f"remark: without {nu / 'tall_bottle/mask_erosion'}/, no figures inside the mask" in lines
+    assert lines[-1] == "1 of 4 scenes are ready; with what is there: RUN='scene=nu_nerf/tall_bottle'"
+
+
+def test_an_unknown_dataset_is_refused(capsys):
+    assert main(["check", "data=blender"]) == 1
+    assert "choose one of ref_real, nu_nerf" in capsys.readouterr().err
