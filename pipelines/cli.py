@@ -8,7 +8,6 @@ import os
 import sys
 import traceback
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 
@@ -219,32 +218,9 @@ def dashboard(words: list[str]) -> int:
     parser.add_argument("--root", type=Path, default=_root(), help="folder that holds mlflow.db (default: %(default)s)")
     parser.add_argument("--port", type=int, default=5000)
     options = parser.parse_args(words)
-    database = (options.root / "mlflow.db").absolute()
-    if not database.is_file():
-        raise RtgsError(f"{database} does not exist yet: `rtgs run` (with tracking=mlflow) makes it")
-    import subprocess
+    from pipelines.dashboard import serve
 
-    environment = os.environ | {
-        "MLFLOW_DISABLE_TELEMETRY": "true",
-        "DO_NOT_TRACK": "true",
-        "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false",
-    }
-    print(f"http://127.0.0.1:{options.port}  (experiments rtgs/runs and rtgs/steps; Ctrl-C ends it)", flush=True)
-    server = [
-        sys.executable,
-        "-m",
-        "mlflow",
-        "ui",
-        "--workers",
-        "1",
-        "--host",
-        "127.0.0.1",
-        "--port",
-        str(options.port),
-    ]
-    with suppress(KeyboardInterrupt):
-        return subprocess.run([*server, "--backend-store-uri", f"sqlite:///{database}"], env=environment).returncode
-    return 0
+    return serve(options.root, options.port)
 
 
 def _root() -> Path:

@@ -60,7 +60,7 @@ def render(params: RenderParams, context: StepContext) -> None:
                 tensors[GIVEN] = method.render(view.camera, stage.until, given, view.mask).image.contiguous()
             if params.maps:
                 options = RenderOptions(depth=True, normal="normal" in method.maps, layers=True)
-                tensors |= _maps(method.render(view.camera, stage.until, options, view.mask))
+                tensors |= view_maps(method.render(view.camera, stage.until, options, view.mask))
         save_file(tensors, context.out / "views" / f"{stem}.safetensors")
         write_png(context.out / "images" / f"{stem}.png", to_bytes(image))
     (context.out / TIMES_FILE).write_text(json.dumps({"seconds": seconds}, indent=1) + "\n", encoding="utf-8")
@@ -68,7 +68,8 @@ def render(params: RenderParams, context: StepContext) -> None:
         context.log.info("rendered %d test views, %.3f s each", len(seconds), sum(seconds.values()) / len(seconds))
 
 
-def _maps(rendered: RenderedView) -> dict[str, Tensor]:
+def view_maps(rendered: RenderedView) -> dict[str, Tensor]:
+    """Depth, normal, alpha and the layers of a view rendered with ``depth``, as :func:`render` stores them."""
     buffers = rendered.buffers
     assert buffers.depth is not None
     depth = buffers.depth / buffers.alpha.clamp_min(1e-6)  # the buffer holds the sum of w z

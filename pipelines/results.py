@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from filelock import FileLock
 
 from pipelines.evaluate import TABLE_CSV, TABLE_JSON
+from pipelines.pictures import final_pictures, training_pictures
 from pipelines.report import PAGE
 from pipelines.training import read_history, stage_params
 from rtgs.config.schema import Choices, RunConfig
@@ -193,12 +194,27 @@ def track_end(tracker: Tracker, folder: Path, results: Sequence[StepResult]) -> 
     tracker.metrics({f"cost/{name}": value for name, value in facts.items() if value is not None})
     tracker.metrics({"surfels": float(table.facts.surfels or 0)})
     tracker.table("eval", [{"view": row.view, **row.values} for row in table.rows])
+    _track_sliders(tracker, results)
     for path in sorted((folder / "renders").glob("*.png"))[:_TRACKED_IMAGES]:
         _track_png(tracker, f"renders/{path.stem}", path)
         _track_png(tracker, f"errors/{path.stem}", folder / "errors" / path.name)
     for name in (PAGE, TABLE_JSON, TABLE_CSV, "config.yaml", RUN_FILE, "point_cloud.ply"):
         if (folder / name).is_file():
             tracker.artifact(folder / name)
+
+
+def _track_sliders(tracker: Tracker, results: Sequence[StepResult]) -> None:
+    """Fixed views and layers at several steps, the last of them as the test views were rendered."""
+    from rtgs.scenes.canonical import read_scene
+
+    places = folders(results)
+    last = final_training(results)
+    for result in results:
+        if result.step.name.startswith("train_"):
+            for picture in training_pictures(result.folder):
+                tracker.image(picture.key, picture.pixels, picture.step)
+    for picture in final_pictures(read_scene(places["import_scene"]), places["render"], stage_params(last).until):
+        tracker.image(picture.key, picture.pixels, picture.step)
 
 
 def _track_png(tracker: Tracker, name: str, path: Path) -> None:

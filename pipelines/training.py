@@ -44,12 +44,13 @@ def train_stage(params: StageParams, context: StepContext, object_mesh: ObjectMe
     """Train from ``from_step`` to ``until`` on the scene, going on from a checkpoint of a killed attempt.
 
     Writes ``checkpoint/`` (state of the method at the end), ``<set>.ply`` for every set of surfels, ``summary.json``,
-    ``history.jsonl`` (the recorded metrics), and with an ``object_mesh`` a copy of it in ``object_mesh/``. Returns the
-    trained method.
+    ``history.jsonl`` (the recorded metrics), ``pictures/`` of fixed views where the training is long enough, and with
+    an ``object_mesh`` a copy of it in ``object_mesh/``. Returns the trained method.
 
     Raises:
         TrainingDiverged: a loss or gradient is not finite.
     """
+    from pipelines.pictures import FOLDER, TrainingPictures
     from rtgs.gaussians.ply import write_ply
     from rtgs.mesh.container import write_object_mesh
     from rtgs.methods import Stage, create_method
@@ -73,6 +74,7 @@ def train_stage(params: StageParams, context: StepContext, object_mesh: ObjectMe
         progress=progress_for(),
         recorder=recorder,
         checkpoint_dir=checkpoints,
+        observer=TrainingPictures(scene, context.partial / FOLDER, params.schedule.total),
     )
     summary = trainer.run()
     newest = max(checkpoints.glob("step_*"))
@@ -85,6 +87,8 @@ def train_stage(params: StageParams, context: StepContext, object_mesh: ObjectMe
     record = {key: _finite(value) for key, value in asdict(summary).items()}
     (context.out / SUMMARY_FILE).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
     recorder.write_history(context.out / HISTORY_FILE)
+    if (context.partial / FOLDER).is_dir():
+        shutil.copytree(context.partial / FOLDER, context.out / FOLDER)
     numbers = {f"final/{key}": value for key, value in record.items() if isinstance(value, (int, float))}
     context.tracker.metrics(numbers)
     return method

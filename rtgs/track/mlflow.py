@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import os
+import secrets
 import sqlite3
 import time
 import warnings
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from mlflow.tracking import MlflowClient
 
 FINGERPRINT_TAG = "rtgs.fingerprint"
+LOCK_TAG = "rtgs.lock"  # name of the kernel lock that a run holds for as long as its process lives
 PARENT_TAG = "mlflow.parentRunId"  # MLflow's own: its pages fold children under it
 _FLUSH_CALLS = 50  # calls of metrics() between two writes
 _FLUSH_SECONDS = 30.0
@@ -147,14 +149,15 @@ class MlflowTracking:
     def run(self, info: RunInfo) -> Iterator[Tracker]:
         """A new run, held by a kernel lock for as long as this process lives."""
         experiment = self._experiment(info.experiment)
-        self._reap(experiment, info.fingerprint)
-        tags = {FINGERPRINT_TAG: info.fingerprint, **info.tags}
+        self._reap([experiment])
+        token = secrets.token_hex(16)
+        tags = {FINGERPRINT_TAG: info.fingerprint, LOCK_TAG: token, **info.tags}
         if info.parent:
             tags[PARENT_TAG] = info.parent
-        run_id = self.client.create_run(experiment, run_name=info.name, tags=tags).info.run_id
-        tracker = MlflowTracker(self.client, run_id)
         status = "FAILED"
-        with self._alive(run_id):
+        with self._alive(token):  # before the run exists: there is no moment at which it has no lock
+            run_id = self.client.create_run(experiment, run_name=info.name, tags=tags).info.run_id
+            tracker = MlflowTracker(self.client, run_id)
             try:
                 yield tracker
                 status = "FINISHED"
@@ -204,33 +207,41 @@ class MlflowTracking:
             location = (self.root / "mlruns").as_uri() if self.local else None
             return client.create_experiment(name, artifact_location=location)
 
+    def reap(self) -> int:
+        """Mark every run that says RUNNING, but whose process on this machine is gone, as KILLED; how many they were."""
+        return self._reap([found.experiment_id for found in self.client.search_experiments()])
+
     @contextmanager
-    def _alive(self, run_id: str) -> Iterator[None]:
-        lock = self._run_lock(run_id)
+    def _alive(self, token: str) -> Iterator[None]:
+        lock = self._run_lock(token)
         try:
             with lock:
                 yield
         finally:
             Path(lock.lock_file).unlink(missing_ok=True)
 
-    def _run_lock(self, run_id: str) -> FileLock:
+    def _run_lock(self, token: str) -> FileLock:
         folder = self.root / "mlruns" / ".locks"
         folder.mkdir(parents=True, exist_ok=True)
-        return FileLock(str(folder / run_id))
+        return FileLock(str(folder / token))
 
-    def _reap(self, experiment: str, fingerprint: str) -> None:
-        """Mark runs of this fingerprint that say RUNNING, but whose process is gone, as KILLED."""
-        running = self.client.search_runs(
-            [experiment], f"attributes.status = 'RUNNING' and tags.`{FINGERPRINT_TAG}` = '{fingerprint}'"
-        )
-        for run in running:
-            lock = self._run_lock(run.info.run_id)
+    def _reap(self, experiments: list[str]) -> int:
+        """A run whose lock file is not here belongs to another machine and is left alone."""
+        dead = 0
+        for run in self.client.search_runs(experiments, "attributes.status = 'RUNNING'"):
+            lock = self._run_lock(run.data.tags.get(LOCK_TAG) or run.info.run_id)
+            if not Path(lock.lock_file).exists():
+                continue
             try:
                 with lock.acquire(timeout=0):
+                    if self.client.get_run(run.info.run_id).info.status != "RUNNING":
+                        continue  # it has ended by itself since it was listed
                     self.client.set_terminated(run.info.run_id, "KILLED")
             except Timeout:
                 continue
             Path(lock.lock_file).unlink(missing_ok=True)
+            dead += 1
+        return dead
 
 
 def _first_line(error: Exception) -> str:

@@ -47,7 +47,7 @@ class Tracker(Protocol):
 class RunInfo:
     """What identifies a tracked run.
 
-    ``fingerprint`` is that of the step, or of the last step of a variant; unfinished runs of the same fingerprint whose
+    ``fingerprint`` is that of the step, or of the last step of a variant. Unfinished runs of the same experiment whose
     process is gone are marked as killed when a new one opens. ``parent``: id of the run of the sweep it belongs to.
     """
 

@@ -46,6 +46,12 @@ class Recorder(Protocol):
     def metrics(self, values: Mapping[str, float], step: int) -> None: ...
 
 
+class Observer(Protocol):
+    """Looks at the method after every step, and leaves it as it was."""
+
+    def look(self, method: Method, step: int) -> None: ...
+
+
 @dataclass(frozen=True)
 class TrainSummary:
     """What a run of the trainer did."""
@@ -95,6 +101,7 @@ class Trainer:
         progress: Progress | None = None,
         recorder: Recorder | None = None,
         checkpoint_dir: Path | None = None,
+        observer: Observer | None = None,
     ) -> None:
         self.method = method
         self.scene = scene
@@ -103,6 +110,7 @@ class Trainer:
         self.progress = progress or SilentProgress()
         self.recorder = recorder
         self.checkpoint_dir = checkpoint_dir
+        self.observer = observer
         self._order = ViewOrder(len(scene.train), seed_for(seed, "views"))
         self._averages = RunningAverages()
         self._step = self.stage.from_step
@@ -204,6 +212,8 @@ class Trainer:
             self.progress.note(f"step {step}: {psnr:.2f} dB on {len(self.scene.test)} test views")
             if self.recorder is not None:
                 self.recorder.metrics({"test/psnr": psnr}, step)
+        if self.observer is not None:
+            self.observer.look(self.method, step)
         if self.checkpoint_dir is not None and (step % self.schedule.checkpoint_every == 0 or last):
             save_checkpoint(self.checkpoint_dir, self.checkpoint())
 

@@ -104,7 +104,7 @@ def test_a_killed_run_is_marked_by_the_next_and_a_live_one_is_not(tracking, root
         assert hanging.poll() is None
         assert time.monotonic() < end
         time.sleep(0.05)
-    info = RunInfo("rtgs/steps", "toy", "a" * 64)
+    info = RunInfo("rtgs/steps", "another recipe", "b" * 64)
 
     def unfinished() -> list[str]:
         with tracking.run(info):
@@ -116,6 +116,19 @@ def test_a_killed_run_is_marked_by_the_next_and_a_live_one_is_not(tracking, root
     hanging.wait(10)
     assert unfinished() == ["KILLED"]
     assert not list((root / "mlruns" / ".locks").iterdir())
+
+
+def test_runs_of_other_machines_are_left_alone_and_all_dead_ones_found(tracking):
+    """A run whose lock is not in this root may be alive somewhere else."""
+    experiment = tracking._experiment("rtgs/far")
+    far = tracking.client.create_run(experiment, tags={"rtgs.lock": "f" * 32}).info.run_id
+    dead = tracking.client.create_run(experiment, tags={"rtgs.lock": "d" * 32}).info.run_id
+    with tracking._run_lock("d" * 32):
+        assert tracking.reap() == 0  # alive
+    assert tracking.reap() == 1
+    assert tracking.client.get_run(far).info.status == "RUNNING"
+    assert tracking.client.get_run(dead).info.status == "KILLED"
+    tracking.client.set_terminated(far, "FINISHED")
 
 
 def test_a_run_id_in_the_environment_is_left_alone(tracking, monkeypatch):
