@@ -13,10 +13,10 @@ from rtgs.pipeline.executors import STEPS_EXPERIMENT
 from rtgs.track.mlflow import PARENT_TAG, MlflowTracking
 
 _PAGE = 1000  # runs counted per experiment
-GUIDE = """In an experiment: the table of runs (columns: eval/psnr, eval/ssim; group by rtgs.method); tick some and Compare
-for curves side by side. In a run: Model metrics has the curves (train/psnr, train/loss), Artifacts > images the
-sliders (<view>/<layer>, one stop per step), tables/eval.json every test view, report.html the page, point_cloud.ply
-the model. The parent run of a sweep holds table.html."""
+GUIDE = """In an experiment: the table of runs (columns eval/psnr, eval/ssim; group by rtgs.method); tick some and
+Compare for curves side by side. In a run: Model metrics has the curves (train/psnr, train/loss), Artifacts > images
+the sliders (<view>/<layer>, one stop per step), tables/eval.json every test view, report.html the page,
+point_cloud.ply the model. The parent run of a sweep holds table.html."""
 
 
 def serve(root: Path, port: int) -> int:

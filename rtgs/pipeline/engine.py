@@ -20,6 +20,7 @@ from rtgs.errors import RtgsError
 from rtgs.pipeline.executors import InlineExecutor
 from rtgs.pipeline.outcome import StepOutcome, SweepOutcomes
 from rtgs.pipeline.plan import Plan
+from rtgs.pipeline.progress import plan_progress
 from rtgs.pipeline.remote import RemoteStore
 from rtgs.pipeline.step import Step
 from rtgs.pipeline.store import Store
@@ -115,7 +116,7 @@ class DaskExecutor:
             futures[step.fingerprint] = self.client.submit(
                 run_step, step, self.job, before, key=f"{step.name}-{step.fingerprint}", pure=False
             )
-        with _watched(plan, len(done)) as tick:
+        with plan_progress(plan, store, len(self.client.nthreads())) as tick:
             for future in as_completed(futures.values()):
                 outcome = _outcome(future)
                 done[outcome.fingerprint] = outcome
@@ -145,38 +146,6 @@ def _outcome(future: Any) -> StepOutcome:
         text = f"step {name} {fingerprint[:8]} failed: {type(error).__name__}: {error}"
         log.error("%s", text)
         return StepOutcome(name, fingerprint, None, 0.0, True, text, fingerprint)
-
-
-@contextmanager
-def _watched(plan: Plan, cached: int) -> Iterator[Any]:
-    """A progress bar over the steps of the whole plan; plain lines where nobody watches."""
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    if not sys.stderr.isatty():
-        total, count = len(plan), [cached]
-
-        def line(outcome: StepOutcome) -> None:
-            count[0] += 1
-            state = "failed" if outcome.failed else f"{outcome.duration:.1f} s" if outcome.executed else "cached"
-            log.info("[%d/%d] %s %s %s", count[0], total, outcome.step, outcome.fingerprint[:8], state)
-
-        yield line
-        return
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-    with Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn()) as bar:
-        task = bar.add_task("steps", total=len(plan), completed=cached)
-
-        def tick(outcome: StepOutcome) -> None:
-            bar.update(task, advance=1, description=f"{outcome.step} {'failed' if outcome.failed else 'done'}")
-
-        yield tick
 
 
 @contextmanager

@@ -13,6 +13,7 @@ from typing import Protocol
 
 from filelock import Timeout
 
+from rtgs.pipeline.expectation import Expectation, PlanClock, spoken
 from rtgs.pipeline.fingerprint import flatten
 from rtgs.pipeline.outcome import StepOutcome, SweepOutcomes, blocked
 from rtgs.pipeline.plan import Plan
@@ -59,17 +60,25 @@ class InlineExecutor:
             StepFailed: a step raised; its message names the step and ``__cause__`` is the step's own exception.
         """
         results: list[StepResult] = []
+        clock = PlanClock(plan, Expectation(self.store))
         for number, planned in enumerate(plan, start=1):
             executed = frozenset(result.step.fingerprint for result in results if result.executed)
-            results.append(self.ensure(planned.step, f"[{number}/{len(plan)}]", executed))
+            left = "" if planned.hit else f", {spoken(clock.left())} left of the plan"
+            result = self.ensure(planned.step, f"[{number}/{len(plan)}{left}]", executed)
+            clock.finish(planned.step.fingerprint, result.duration if result.executed else None)
+            results.append(result)
         return tuple(results)
 
     def attempt(self, plan: Plan) -> SweepOutcomes:
         """Bring every step into the store that can be; one that fails stops only what builds on it."""
         done: dict[str, StepOutcome] = {}
+        clock = PlanClock(plan, Expectation(self.store))
         for number, planned in enumerate(plan, start=1):
             before = (done[other.fingerprint] for other in planned.step.upstream)
-            done[planned.step.fingerprint] = self.outcome(planned.step, f"[{number}/{len(plan)}]", before)
+            position = f"[{number}/{len(plan)}, {spoken(clock.left())} left of the plan]"
+            outcome = self.outcome(planned.step, position, before)
+            clock.finish(outcome.fingerprint, outcome.duration if outcome.executed else None)
+            done[planned.step.fingerprint] = outcome
         return SweepOutcomes(done)
 
     def outcome(self, step: Step, position: str, before: Iterable[StepOutcome]) -> StepOutcome:

@@ -208,7 +208,7 @@ class MlflowTracking:
             return client.create_experiment(name, artifact_location=location)
 
     def reap(self) -> int:
-        """Mark every run that says RUNNING, but whose process on this machine is gone, as KILLED; how many they were."""
+        """Mark every run that says RUNNING and whose process on this machine is gone as KILLED; returns how many."""
         return self._reap([found.experiment_id for found in self.client.search_experiments()])
 
     @contextmanager
