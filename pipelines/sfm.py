@@ -78,7 +78,7 @@ def sfm(params: SfmParams, context: StepContext) -> None:
 
 STEP = StepKind(
     "sfm",
-    2,
+    3,
     sfm,
     helpers=(
         "rtgs.prepare.poses",

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Iterable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,7 @@ from rtgs.scenes.images import NORMAL_SUFFIXES, read_normals, same_aspect, unit_
 from rtgs.scenes.undistort import Lens, undistort_image, undistort_nearest
 
 MODEL_DIR = "sparse/0"
+LENSES_FILE = "lenses.json"
 IMAGES_DIR = "images"
 
 
@@ -98,6 +101,21 @@ def carry_normals(photos: PhotoSet, lenses: dict[str, Lens], folder: Path, targe
         np.save(place, flat.astype(np.float16).astype(np.float32))
         count += 1
     return count
+
+
+def write_lenses(lenses: dict[str, Lens], out: Path) -> None:
+    """Write the lenses of the photos before they were undistorted: marks made on those can be carried over."""
+    values = {name: asdict(lens) for name, lens in sorted(lenses.items())}
+    (out / LENSES_FILE).write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
+
+
+def read_lenses(folder: Path) -> dict[str, Lens]:
+    """What :func:`write_lenses` wrote; empty for a capture whose photos were not undistorted here."""
+    path = folder / LENSES_FILE
+    if not path.is_file():
+        return {}
+    values = json.loads(path.read_text(encoding="utf-8"))
+    return {name: Lens(**{**lens, "params": tuple(lens["params"])}) for name, lens in values.items()}
 
 
 def model_lenses(images: Iterable[Any]) -> dict[str, Lens]:

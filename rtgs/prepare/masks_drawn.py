@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import difflib
 import json
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -135,7 +136,9 @@ def _photo(path: Path, named: object, views: tuple[str, ...]) -> str:
     text = str(named)
     if text in views:
         return text
-    fitting = [view for view in views if Path(view).name == text or Path(view).stem == text]
+    plain = {text, Path(text).stem if Path(text).suffix else text}
+    plain |= {re.sub(r"\s", "_", name) for name in plain}  # as photos without poses are named
+    fitting = [view for view in views if Path(view).name in plain or Path(view).stem in plain]
     if len(fitting) == 1:
         return fitting[0]
     if fitting:

@@ -14,8 +14,9 @@ from PIL import Image, PngImagePlugin
 
 from rtgs.pipeline.fingerprint import canonical_json
 from rtgs.prepare.errors import PrepareError
+from rtgs.prepare.export import read_lenses
 from rtgs.prepare.masks_detect import Box, Detector, PromptTokenizer
-from rtgs.prepare.masks_drawn import Cutout, Drawing, read_drawing
+from rtgs.prepare.masks_drawn import Cutout, read_drawing
 from rtgs.prepare.masks_given import given_files, read_given
 from rtgs.prepare.masks_grabcut import Marks, grab_cut
 from rtgs.prepare.masks_hull import Hull, SmallMask, carve, small_mask
@@ -27,6 +28,7 @@ from rtgs.prepare.weights import REGISTRY, find_weights
 from rtgs.scenes.canonical import content_hash
 from rtgs.scenes.capture import Capture, CaptureView, list_some
 from rtgs.scenes.images import image_size, nearest_resize, read_mask, read_photo, same_aspect
+from rtgs.scenes.undistort import project, unproject
 
 CACHE_VERSION = 1  # of single masks by networks
 _PLANE_SIDE = 1600  # pixels, long side of the masks of panes; the import brings them to the size of the views
@@ -273,6 +275,7 @@ class DrawnMaker(_PlainMaker):
         """
         self._settings, self._clean = settings.drawn, settings.clean
         by_name = {view.name: view for view in views}
+        self._lenses = read_lenses(capture.root)
         self._drawing = read_drawing(source / settings.drawn.file, by_name)
         self._cutouts = self._drawing.cutouts if method in ("grabcut", "drawn") else {}
         panes = self._drawing.panes if method in ("polygon", "drawn") else {}
@@ -280,7 +283,13 @@ class DrawnMaker(_PlainMaker):
             wanted, other = ("panes", "grabcut") if method == "polygon" else ("cutouts", "polygon")
             raise PrepareError(f"{self._drawing.path} has no {wanted}, which masks={method} needs: set masks={other}")
         self._panes = [
-            fit_pane(name, _on_photos(self._drawing, corners, by_name), by_name, capture.points, self._settings)
+            fit_pane(
+                name,
+                {photo: self._shares(marks, by_name[photo]) for photo, marks in corners.items()},
+                by_name,
+                capture.points,
+                self._settings,
+            )
             for name, corners in panes.items()
         ]
         self.solid = not self._panes
@@ -311,6 +320,20 @@ class DrawnMaker(_PlainMaker):
             return Made(cut, how)
         return Made(nearest_resize(inside, cut.shape[1], cut.shape[0]) | cut, f"{origin}; {how}")
 
+    def _shares(self, points: np.ndarray, view: CaptureView) -> np.ndarray:
+        """Marks (N, 2) as shares of the capture's photo, whose lens may be another than that of the photo marked."""
+        original = self._lenses.get(view.name)
+        if original is None:
+            return self._drawing.shares(points, upright_size(view))
+        assert view.lens is not None
+        size = (original.width, original.height)
+        rays = unproject(original, self._drawing.shares(points, size) * size)
+        return project(view.lens, rays) / (view.lens.width, view.lens.height)
+
+    def _marks(self, cutout: Cutout, view: CaptureView) -> Marks:
+        box = self._shares(np.reshape(cutout.box, (-1, 2)), view).ravel()
+        return Marks(tuple(box.tolist()), self._shares(cutout.inside, view), self._shares(cutout.outside, view))
+
     def _pane_mask(self, view: CaptureView) -> tuple[np.ndarray | None, str]:
         if not self._panes:
             return None, ""
@@ -324,8 +347,7 @@ class DrawnMaker(_PlainMaker):
     def _cut(self, view: CaptureView) -> tuple[np.ndarray | None, str]:
         if view.name in self._cutouts:
             photo = _photo(view)
-            marks = _marks(self._cutouts[view.name], self._drawing, (photo.shape[1], photo.shape[0]))
-            return grab_cut(photo, marks, self._settings), "GrabCut from marks"
+            return grab_cut(photo, self._marks(self._cutouts[view.name], view), self._settings), "GrabCut from marks"
         if not self._cutouts or not self._settings.carry or len(self._marked) < _CARRY_VIEWS:
             return None, ""
         if self._hull is None:
@@ -338,23 +360,11 @@ class DrawnMaker(_PlainMaker):
         return grab_cut(photo, Marks(rough=rough), self._settings), "GrabCut from the hull of the marked photos"
 
 
-def _on_photos(
-    drawing: Drawing, corners: dict[str, np.ndarray], views: dict[str, CaptureView]
-) -> dict[str, np.ndarray]:
-    return {photo: drawing.shares(marks, upright_size(views[photo])) for photo, marks in corners.items()}
-
-
 def upright_size(view: CaptureView) -> tuple[int, int]:
     """Width and height of a photo's file as :func:`rtgs.scenes.images.read_photo` turns it."""
     assert view.lens is not None
     size = image_size(view.image)
     return size if same_aspect(size, (view.lens.width, view.lens.height)) else (size[1], size[0])
-
-
-def _marks(cutout: Cutout, drawing: Drawing, size: tuple[int, int]) -> Marks:
-    box = drawing.shares(np.reshape(cutout.box, (-1, 2)), size).ravel()
-    inside, outside = (drawing.shares(points, size) for points in (cutout.inside, cutout.outside))
-    return Marks(tuple(box.tolist()), inside, outside)
 
 
 def _words(pane: Pane, limit: float) -> str:

@@ -85,6 +85,7 @@ def _find_poses(
     model = result.models[0]
     report.world.apply_to(model)
     export.write_capture(model, place.photos, out, work, settings.jpeg_quality, threads)
+    export.write_lenses(export.model_lenses(quality.registered_images(model)), out)
     _carry_side_files(request, photos, model, out, say)
     counts = sfm.match_counts(photos.names, place)
     quality.draw_coverage(model, report.missing, counts, out / quality.PICTURE_FILE)

@@ -53,10 +53,10 @@ def ball_mask(pose: Pose, width: int = WIDTH, height: int = HEIGHT) -> np.ndarra
 
 
 def shots(count: int, width: int = WIDTH, height: int = HEIGHT) -> list[Shot]:
-    """Photos of the room with the ball; the room is dull, so that blue means ball."""
+    """Photos of the room with the ball; the room is grey, so that blue means ball."""
     result = []
     for index, pose in enumerate(poses(count)):
-        room = (photo(pose, width=width, height=height).astype(np.float32) * 0.4 + 70).astype(np.uint8)
+        room = np.repeat(photo(pose, width=width, height=height).mean(axis=-1, keepdims=True), 3, axis=-1)
         mask = ball_mask(pose, width, height)
         result.append(Shot(f"photo_{index:02d}.png", pose, np.where(mask[..., None], [10, 30, 250], room), mask))
     return [Shot(shot.name, shot.pose, shot.pixels.astype(np.uint8), shot.mask) for shot in result]

@@ -253,6 +253,48 @@ def test_masks_reach_the_training_through_the_command_line(capture, root, weight
     assert "cached" in plan(capsys, *words[1:-1])["masks"]
 
 
+def test_photos_without_poses_become_a_table_with_masked_figures(root, weights, tmp_path, capsys):
+    """Photos -> poses -> masks from words -> training -> table; then a pane marked on the photos as they were taken."""
+    from tests.prepare.test_masks_drawn import PANE
+
+    taken = shots(8, 320, 240)
+    photos = tmp_path / "my photos"
+    photos.mkdir()
+    for shot in taken:
+        Image.fromarray(shot.pixels).save(photos / shot.name)
+    glass_scene.write_networks(weights)
+    words = [f"scene={photos}", "preset=smoke", "scene.long_side=64", "method=2dgs", "threads=1", "tracking=off"]
+    words += ["schedule.total=4", "schedule.checkpoint_every=2", "sfm.features.max_features=800"]
+    words += ["masks.clean.voxels=32", "masks.detector.short_side=240"]
+    rows = plan(capsys, *words, "masks=grounded_sam2")
+    assert list(rows)[1:5] == ["normals", "sfm", "masks", "import_scene"]
+    assert main(["run", *words, "masks=grounded_sam2"]) == 0
+    (run,) = (path for path in (root / "runs").iterdir() if path.is_dir())
+    report = MaskReport.read(run)
+    assert (report.masks, len(report.rows)) == (8, 8)
+    assert not report.flagged
+    assert "psnr_masked" in (run / "metrics.json").read_text()
+    (made,) = (root / "store/masks").glob("*/*/masks")
+    for shot in taken:
+        found = Image.fromarray(read_mask(made / f"{shot.name}.png")).resize((320, 240))
+        assert overlap(np.asarray(found), shot.mask) > 0.88, "undistorted with the photo"
+    focal = 2 * glass_scene.FOCAL
+    drawn = {}
+    for shot in (taken[1], taken[6]):
+        local = PANE @ shot.pose.rotation.T + shot.pose.translation
+        drawn[shot.name] = (local[:, :2] / local[:, 2:] * focal + (160, 120)).round(2).tolist()
+    marks(photos, panes={"window": drawn})
+    capsys.readouterr()
+    again = plan(capsys, *words)
+    assert "cached" in again["sfm"], "marks do not concern the poses"
+    assert "to run" in again["masks"]
+    assert main(["run", *words]) == 0
+    carried = MaskReport.read(run)
+    assert carried.method == "polygon"
+    error = float(carried.notes[0].split("carried corners ")[1].split(" %")[0])
+    assert error < 0.6, "per cent of the photo: poses and lens are estimated"
+
+
 def test_the_networks_are_registered(capsys, weights, tmp_path):
     glass_scene.write_networks(weights)
     assert main(["weights", "status"]) == 0
