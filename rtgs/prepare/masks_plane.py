@@ -2,6 +2,7 @@
 
 With corners x_k = c + a_k e1 + b_k e2 + (h + t1 a_k + t2 b_k) n on one plane, all of a, b, h, t1, t2 are fitted to the
 drawn corners by least squares of their distances in the photos; where to start comes from the rays' nearest points.
+A pane drawn in one photo only lies on the plane of the points around it, its frame: points inside it lie behind glass.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from rtgs.prepare.masks_settings import DrawnSettings
 from rtgs.scenes.capture import CaptureView, PointCloud
 from rtgs.scenes.undistort import Lens, project, unproject
 
-_MIN_POINTS = 12  # on a pane that is drawn in one photo only
+_MIN_POINTS = 12  # around a pane that is drawn in one photo only
 _TRIALS = 500  # planes through three points that are tried
 _FLATNESS = 0.01  # of the pane's distance: how near to the plane a point of it lies
 
@@ -37,7 +38,7 @@ class Pane:
         """Where its plane comes from, in words."""
         if self.angle:
             return f"corners drawn in {len(self.error)} photos, {self.angle:.0f} degrees apart"
-        return "corners drawn in one photo, plane through the points seen in it"
+        return "corners drawn in one photo, plane through the points around it"
 
 
 def fit_pane(
@@ -56,7 +57,7 @@ def fit_pane(
     rays = {photo: _rays(views[photo], corners) for photo, corners in drawn.items()}
     if len(rays) == 1:
         ((photo, directions),) = rays.items()
-        corners, normal = _on_points(name, views[photo], directions, drawn[photo], points)
+        corners, normal = _on_frame(name, views[photo], directions, drawn[photo], points, settings)
         return Pane(name, corners, normal, 0.0, {photo: 0.0})
     centers = np.array([views[photo].center for photo in rays])
     directions = np.array(list(rays.values()))  # (V, K, 3)
@@ -168,32 +169,46 @@ def _error(view: CaptureView, corners: np.ndarray, shares: np.ndarray) -> float:
     return float(np.linalg.norm(_shift(view, corners, shares), axis=1).mean())
 
 
-def _on_points(
-    name: str, view: CaptureView, rays: np.ndarray, shares: np.ndarray, points: PointCloud | None
+def _on_frame(
+    name: str,
+    view: CaptureView,
+    rays: np.ndarray,
+    shares: np.ndarray,
+    points: PointCloud | None,
+    settings: DrawnSettings,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Corners where rays (K, 3) meet the plane that most of the points seen inside the pane lie on; its normal."""
-    assert view.lens is not None
+    """Corners where rays (K, 3) meet the plane that most of the points around the pane lie on; its normal."""
     advice = "draw it in a second photo, from another side"
     if points is None:
         raise PrepareError(f"pane {name} is drawn in one photo and the capture has no points: {advice}")
-    local = points.positions @ view.rotation.T + view.translation
-    ahead = local[:, 2] > 1e-6
-    pixels = project(view.lens, local[ahead])
-    near = points.positions[ahead][_in_polygon(pixels / (view.lens.width, view.lens.height), shares)]
+    near = _around(view, shares, points, 1 + settings.frame)
     if len(near) < _MIN_POINTS:
-        raise PrepareError(f"pane {name} is drawn in one photo, and {len(near)} points are seen inside it: {advice}")
+        near = _around(view, shares, points, 1 + 2 * settings.frame)
+    if len(near) < _MIN_POINTS:
+        raise PrepareError(f"pane {name} is drawn in one photo, and {len(near)} points are seen around it: {advice}")
     normal, spot, share = _plane_of(near, view.center)
     if share < 0.5:
         raise PrepareError(
-            f"pane {name} is drawn in one photo, and only {share:.0%} of the {len(near)} points seen inside it lie on "
-            f"one plane (behind glass they rarely do): {advice}"
+            f"pane {name} is drawn in one photo, and only {share:.0%} of the {len(near)} points seen around it lie on "
+            f"one plane: {advice}"
         )
     reach = ((spot - view.center) @ normal) / (rays @ normal)
     if not (np.isfinite(reach) & (reach > 0)).all():
         raise PrepareError(
-            f"pane {name}: the plane of its points is seen edge on in the photo it is drawn in: {advice}"
+            f"pane {name}: the plane of the points around it is seen edge on in the photo it is drawn in: {advice}"
         )
     return view.center + reach[:, None] * rays, normal
+
+
+def _around(view: CaptureView, shares: np.ndarray, points: PointCloud, grown: float) -> np.ndarray:
+    """The points (N, 3) seen outside the pane, inside the pane ``grown`` times as large about its middle."""
+    assert view.lens is not None
+    local = points.positions @ view.rotation.T + view.translation
+    ahead = local[:, 2] > 1e-6
+    pixels = project(view.lens, local[ahead]) / (view.lens.width, view.lens.height)
+    middle = shares.mean(axis=0)
+    ring = _in_polygon(pixels, middle + (shares - middle) * grown) & ~_in_polygon(pixels, shares)
+    return points.positions[ahead][ring]
 
 
 def _plane_of(points: np.ndarray, center: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:

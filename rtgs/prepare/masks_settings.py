@@ -118,6 +118,8 @@ class DrawnSettings:
     """Of a click, in long sides of the photo."""
     min_angle: float = 2.0
     """Degrees between the rays to a corner of a pane below which its depth is not believed."""
+    frame: float = 0.3
+    """Of a pane's size: how far its frame reaches beyond it, whose points give the plane where it is drawn once."""
     max_error: float = 0.01
     """Distance between a drawn corner and the carried one, in long sides of the photo, above which a warning names the
     photo."""
@@ -126,6 +128,7 @@ class DrawnSettings:
         _check_least("masks.drawn.grabcut_rounds", self.grabcut_rounds, 1)
         _check_least("masks.drawn.grabcut_side", self.grabcut_side, 64)
         _check_least("masks.drawn.min_angle", self.min_angle, 0.0)
+        _check_least("masks.drawn.frame", self.frame, 0.05)
 
 
 @dataclass(frozen=True)
