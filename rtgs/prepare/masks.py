@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 from rtgs.prepare.errors import PrepareError
-from rtgs.prepare.masks_hull import Hull, SmallMask, common_hull, compare, limits, small_mask
+from rtgs.prepare.masks_hull import Consensus, Hull, SmallMask, find_consensus, limits, small_mask
 from rtgs.prepare.masks_makers import Made, Maker, make_maker
 from rtgs.prepare.masks_report import METHODS, PICTURE_FILE, MaskReport, MaskRow, Tile, draw_masks
 from rtgs.prepare.masks_settings import CleanSettings, MaskSettings
@@ -22,6 +22,7 @@ from rtgs.scenes.scene import select_views
 from rtgs.scenes.settings import SceneSettings
 
 MASKS_DIR = "masks"
+_SMALL = 0.1  # share that a mask may miss of the hull's silhouette and is not filled up: its holes may be true
 
 
 @dataclass(frozen=True)
@@ -66,13 +67,13 @@ def make_masks(request: MaskRequest, out: Path, say: Say) -> MaskReport:
     rows = [made[view.name] for view in views]
     if not any(mask.votes for mask in small.values()):
         rows = [_forgotten(row, out) for row in rows]
-        hull, checked = None, "nothing found in any photo: the scene goes on without masks"
+        common, checked = None, "nothing found in any photo: the scene goes on without masks"
     else:
-        hull, checked = _common(maker, list(small.values()), request.settings.clean)
-    if hull is not None:
-        rows = [_cleaned(row, hull, small.get(row.name), request, out) for row in rows]
+        common, checked = _common(maker, list(small.values()), request.settings.clean)
+    if common is not None:
+        rows = [_cleaned(row, common, small.get(row.name), request, out) for row in rows]
     report = MaskReport(request.method, maker.networks, tuple(rows), checked, cached, maker.notes)
-    _finish(report, out, {view.name: view for view in views}, request.scene, hull, small)
+    _finish(report, out, {view.name: view for view in views}, request.scene, common.hull if common else None, small)
     say(str(report))
     return report
 
@@ -99,28 +100,29 @@ def _forgotten(row: MaskRow, out: Path) -> MaskRow:
     return replace(row, origin="", note=row.note or row.origin)
 
 
-def _common(maker: Maker, masks: Sequence[SmallMask], clean: CleanSettings) -> tuple[Hull | None, str]:
+def _common(maker: Maker, masks: Sequence[SmallMask], clean: CleanSettings) -> tuple[Consensus | None, str]:
     """The hull of all masks, and in words how they were compared or why not."""
     voting = sum(mask.votes for mask in masks)
     if not maker.solid:
         return None, "not compared by a hull: flat panes have none"
     if voting < clean.min_views:
         return None, f"not compared with each other: {voting} photos show something, {clean.min_views} are needed"
-    hull = common_hull(masks, clean)
-    if hull is None:
+    common = find_consensus(masks, clean)
+    if common is None:
         return None, (
             "not compared with each other: most masks have no hull in common; either they mark different things, or "
             "what they mark moved, or the poses are wrong"
         )
-    return hull, f"compared with the hull of {voting} masks ({len(hull)} voxels of {hull.voxel:.3g})"
+    how = "holes filled" if common.form == "filled" else "as convex hulls, since something stands before the glass"
+    return common, f"compared with the hull of {voting} masks ({how})"
 
 
-def _cleaned(row: MaskRow, hull: Hull, mask: SmallMask | None, request: MaskRequest, out: Path) -> MaskRow:
+def _cleaned(row: MaskRow, common: Consensus, mask: SmallMask | None, request: MaskRequest, out: Path) -> MaskRow:
     """A row with its agreement; the mask on disk is repaired or dropped where it is too low and that is wanted."""
     clean = request.settings.clean
     if mask is None:
         return row
-    found = compare(hull, mask)
+    found = common.agreement[row.name]
     flagged = found.value < clean.min_agreement
     row = replace(row, agreement=found.value, missing=found.missing, extra=found.extra, flagged=flagged)
     action = clean.action if clean.action != "auto" else "flag" if request.method == "given" else "repair"
@@ -132,8 +134,11 @@ def _cleaned(row: MaskRow, hull: Hull, mask: SmallMask | None, request: MaskRequ
         return replace(row, origin="", action="dropped")
     inside = read_mask(path)
     height, width = inside.shape
-    least, most = (nearest_resize(limit, width, height) for limit in limits(hull, mask))
-    repaired = (inside | least) & most if inside.any() else nearest_resize(hull.silhouette(mask), width, height)
+    if not inside.any():
+        repaired = nearest_resize(common.hull.silhouette(mask), width, height)
+    else:
+        least, most = (nearest_resize(limit, width, height) for limit in limits(common.hull, mask))
+        repaired = inside & most if found.missing < _SMALL else (inside | least) & most
     write_mask(repaired, path)
     return replace(row, area=float(repaired.mean()), action="repaired" if inside.any() else "from the hull")
 

@@ -1,11 +1,12 @@
-"""What a person marked in a few photos: boxes and clicks for GrabCut, corners of flat panes; a file beside the photos.
+"""What a person marked in a few photos: corners of flat panes, outlines, boxes and clicks; a file beside the photos.
 
 units: pixels                # of the photo, x right, y down; or `fraction`, of its width and height
 panes:                       # flat glass: the same corners in the same order in two photos or more
   door:
     IMG_01.jpg: [[120, 80], [430, 92], [425, 610], [118, 600]]
     IMG_07.jpg: [[101, 85], [398, 70], [402, 598], [99, 611]]
-cutouts:                     # anything else: a box around it, or a few clicks
+cutouts:                     # anything else: its outline, a box around it, or a few clicks
+  IMG_02.jpg: {outline: [[110, 70], [400, 66], [412, 300], [396, 555], [121, 540]]}
   IMG_03.jpg: {box: [100, 60, 420, 560], inside: [[250, 300]], outside: [[110, 70]]}
 """
 
@@ -25,7 +26,7 @@ from rtgs.prepare.errors import PrepareError
 from rtgs.scenes.capture import list_some
 
 _KEYS = ("units", "panes", "cutouts")
-_CUTOUT_KEYS = ("box", "inside", "outside")
+_CUTOUT_KEYS = ("outline", "box", "inside", "outside")
 UNITS = ("pixels", "fraction")
 
 
@@ -36,6 +37,7 @@ class Cutout:
     box: tuple[float, ...]  # left, top, right, bottom; empty: none
     inside: np.ndarray  # (N, 2) clicks on the object
     outside: np.ndarray  # (M, 2) clicks beside it
+    outline: np.ndarray  # (K, 2) corners of its outline; empty: GrabCut finds it
 
 
 @dataclass(frozen=True)
@@ -160,13 +162,12 @@ def _points(path: Path, where: str, value: object, least: int = 0) -> np.ndarray
 
 def _cutout(path: Path, photo: str, marks: object) -> Cutout:
     if not isinstance(marks, dict) or not marks or set(marks) - set(_CUTOUT_KEYS):
-        raise PrepareError(
-            f"{path}: cutout {photo} is {marks!r}: give box: [left, top, right, bottom], inside, outside"
-        )
+        raise PrepareError(f"{path}: cutout {photo} is {marks!r}: give outline, box, inside or outside")
     box = tuple(_points(path, f"the box of {photo}", marks.get("box")).reshape(-1).tolist())
     if box and not (len(box) == 4 and box[0] < box[2] and box[1] < box[3]):
         raise PrepareError(f"{path}: the box of {photo} is {list(box)}: give [left, top, right, bottom]")
     inside, outside = (_points(path, f"{key} of {photo}", marks.get(key)) for key in ("inside", "outside"))
-    if not box and not len(inside):
-        raise PrepareError(f"{path}: cutout {photo} has neither a box nor a click inside: GrabCut needs one of them")
-    return Cutout(box, inside, outside)
+    outline = _points(path, f"the outline of {photo}", marks["outline"], least=3) if "outline" in marks else inside[:0]
+    if not (box or len(inside) or len(outline)):
+        raise PrepareError(f"{path}: cutout {photo} has no outline, no box and no click inside: give one of them")
+    return Cutout(box, inside, outside, outline)

@@ -2,12 +2,14 @@
 
 A voxel belongs to the hull where the (k+1)-th smallest of its signed distances to the masks' outlines, over the photos
 that see it, is positive: k photos may be wrong (k is a share of the photos). Photos that do not see it do not vote.
+What stands before the glass or sticks to it makes holes in its masks: they are compared with their holes filled, or as
+their convex hulls, where that makes more of them agree (a label across a bottle).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,6 +20,8 @@ from rtgs.scenes.undistort import Lens, project
 
 _SEEN_SHARE = 0.3  # of the photos with a mask that must see a voxel
 _COARSE = 32  # voxels on the long side while the box is looked for
+FORMS = ("filled", "convex")
+_MOST = 0.9  # of the masks that must agree as they are, holes filled, for their convex hulls not to be tried
 _BETTER = 0.01  # agreement that must be won for one more mask to be allowed wrong
 _LEAST = 0.5  # agreement of the middle mask below which a hull is no hull of anything
 _MARGIN = 0.3  # beyond the frame of the undistorted photo, lens models fold back
@@ -48,6 +52,20 @@ def small_mask(view: CaptureView, mask: np.ndarray, side: int) -> SmallMask:
     small = nearest_resize(mask, columns, rows)
     lens = view.lens.resized(columns, rows)
     return SmallMask(view.name, view.rotation, view.translation, lens, small, signed_distance(small))
+
+
+def in_form(inside: np.ndarray, form: str) -> np.ndarray:
+    """(h, w) bool with holes filled, or its convex hull."""
+    import cv2
+
+    if form == "convex":
+        points = np.argwhere(inside)[:, ::-1].astype(np.int32)
+        if len(points) < 3:
+            return inside
+        return cv2.fillConvexPoly(np.zeros(inside.shape, np.uint8), cv2.convexHull(points), 1).astype(bool)
+    from scipy.ndimage import binary_fill_holes
+
+    return np.asarray(binary_fill_holes(inside), dtype=bool)
 
 
 def signed_distance(inside: np.ndarray) -> np.ndarray:
@@ -217,27 +235,65 @@ class Agreement:
         return 1 - self.missing - self.extra
 
 
-def compare(hull: Hull, mask: SmallMask) -> Agreement:
-    """A mask against the hull's silhouette."""
-    least, most = limits(hull, mask)
+def compare(hull: Hull, mask: SmallMask, form: str = "filled") -> Agreement:
+    """A mask against the hull's silhouette, both in a form."""
+    least, most = limits(hull, mask, form)
     either = (mask.inside | least).sum()
     if not either:
         return Agreement(0.0, 0.0)
     return Agreement(float((least & ~mask.inside).sum() / either), float((mask.inside & ~most).sum() / either))
 
 
-def limits(hull: Hull, mask: SmallMask) -> tuple[np.ndarray, np.ndarray]:
+def limits(hull: Hull, mask: SmallMask, form: str = "filled") -> tuple[np.ndarray, np.ndarray]:
     """(h, w) bool twice: what the hull rules in, and all that it does not rule out."""
     import cv2
 
-    silhouette = hull.silhouette(mask).astype(np.uint8)
+    silhouette = in_form(hull.silhouette(mask), form).astype(np.uint8)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * hull.slack(mask) + 1,) * 2)
     return cv2.erode(silhouette, kernel).astype(bool), cv2.dilate(silhouette, kernel).astype(bool)
 
 
-def common_hull(masks: Sequence[SmallMask], settings: CleanSettings) -> Hull | None:
-    """The hull that the masks agree with best: carved with more and more of them allowed to be wrong, then anew from
-    those that agree. None where most masks agree with no hull.
+@dataclass(frozen=True)
+class Consensus:
+    """What the masks of a capture have in common."""
+
+    hull: Hull
+    form: str  # of FORMS: how they were compared
+    agreement: dict[str, Agreement]  # by photo, empty masks included
+
+    def agreeing(self, least: float) -> int:
+        """Masks that agree by ``least``."""
+        return sum(found.value >= least for found in self.agreement.values())
+
+
+def find_consensus(masks: Sequence[SmallMask], settings: CleanSettings) -> Consensus | None:
+    """The hull of the masks with their holes filled, or of their convex hulls where more of them agree on that.
+
+    None where most masks agree with no hull.
+    """
+    best: Consensus | None = None
+    for form in FORMS:
+        shaped = [_in_form(mask, form) for mask in masks]
+        hull = common_hull(shaped, settings, form)
+        if hull is None:
+            continue
+        found = Consensus(hull, form, {mask.name: compare(hull, mask, form) for mask in shaped})
+        least = settings.min_agreement
+        if best is None or found.agreeing(least) > best.agreeing(least):
+            best = found
+        if best.agreeing(least) >= _MOST * sum(mask.votes for mask in masks):
+            break
+    return best
+
+
+def _in_form(mask: SmallMask, form: str) -> SmallMask:
+    inside = in_form(mask.inside, form)
+    return replace(mask, inside=inside, distance=signed_distance(inside))
+
+
+def common_hull(masks: Sequence[SmallMask], settings: CleanSettings, form: str = "filled") -> Hull | None:
+    """The hull that masks in a form agree with best: carved with more and more of them allowed to be wrong, then anew
+    from those that agree. None where most masks agree with no hull.
     """
     voting = [mask for mask in masks if mask.votes]
     count = len(voting)
@@ -247,14 +303,14 @@ def common_hull(masks: Sequence[SmallMask], settings: CleanSettings) -> Hull | N
         hull = carve(voting, settings, (wrong + 0.01) / count)
         if hull is None:
             continue
-        middle = float(np.median([compare(hull, mask).value for mask in voting]))
+        middle = float(np.median([compare(hull, mask, form).value for mask in voting]))
         if best is None or middle > best[0] + _BETTER:
             best = middle, hull
     if best is None or best[0] < _LEAST:
         return None
     hull = best[1]
     for _ in range(2):
-        good = [mask for mask in voting if compare(hull, mask).value >= settings.min_agreement]
+        good = [mask for mask in voting if compare(hull, mask, form).value >= settings.min_agreement]
         again = carve(good, settings, settings.tolerated) if len(good) >= max(3, count // 2) else None
         hull = again or hull
     return hull

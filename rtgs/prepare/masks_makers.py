@@ -20,7 +20,7 @@ from rtgs.prepare.masks_drawn import Cutout, read_drawing
 from rtgs.prepare.masks_given import given_files, read_given
 from rtgs.prepare.masks_grabcut import Marks, grab_cut
 from rtgs.prepare.masks_hull import Hull, SmallMask, carve, small_mask
-from rtgs.prepare.masks_plane import Pane, fit_pane, seen_from
+from rtgs.prepare.masks_plane import Pane, fit_pane, in_polygon, seen_from
 from rtgs.prepare.masks_segment import Segmenter
 from rtgs.prepare.masks_settings import MaskSettings
 from rtgs.prepare.onnx import Network
@@ -262,7 +262,7 @@ def _kept_boxes(path: Path) -> tuple[Box, ...]:
 
 
 class DrawnMaker(_PlainMaker):
-    """Flat panes carried by the poses, and GrabCut; from what a person marked in a few photos."""
+    """Flat panes carried by the poses, outlines and GrabCut; from what a person marked in a few photos."""
 
     def __init__(
         self, method: str, settings: MaskSettings, capture: Capture, views: Sequence[CaptureView], source: Path
@@ -296,6 +296,7 @@ class DrawnMaker(_PlainMaker):
         self.notes = tuple(_words(pane, self._settings.max_error) for pane in self._panes)
         self._marked: list[SmallMask] = []
         self._hull: Hull | None = None
+        self._carved = False
 
     def order(self, views: Sequence[CaptureView]) -> list[CaptureView]:
         """Marked photos first: the others learn from them."""
@@ -345,19 +346,34 @@ class DrawnMaker(_PlainMaker):
         return inside, f"pane drawn here ({', '.join(drawn)})" if drawn else "pane carried by the poses"
 
     def _cut(self, view: CaptureView) -> tuple[np.ndarray | None, str]:
-        if view.name in self._cutouts:
-            photo = _photo(view)
-            return grab_cut(photo, self._marks(self._cutouts[view.name], view), self._settings), "GrabCut from marks"
-        if not self._cutouts or not self._settings.carry or len(self._marked) < _CARRY_VIEWS:
+        cutout = self._cutouts.get(view.name)
+        if cutout is not None and len(cutout.outline):
+            return _filled(self._shares(cutout.outline, view), view), "outlined by a person"
+        if cutout is not None:
+            return grab_cut(_photo(view), self._marks(cutout, view), self._settings), "GrabCut from marks"
+        hull = self._hull_of_marks()
+        if hull is None:
             return None, ""
-        if self._hull is None:
-            self._hull = carve(self._marked, self._clean, 0.0)
-        if self._hull is None:
-            return None, ""
-        photo = _photo(view)
-        blank = small_mask(view, np.zeros(photo.shape[:2], dtype=bool), self._clean.mask_size)
-        rough = self._hull.silhouette(blank)
-        return grab_cut(photo, Marks(rough=rough), self._settings), "GrabCut from the hull of the marked photos"
+        width, height = upright_size(view)
+        rough = hull.silhouette(small_mask(view, np.zeros((height, width), dtype=bool), self._clean.mask_size))
+        if all(len(marks.outline) for marks in self._cutouts.values()):
+            return nearest_resize(rough, width, height), "hull of the outlines"
+        return grab_cut(_photo(view), Marks(rough=rough), self._settings), "GrabCut from the hull of the marked photos"
+
+    def _hull_of_marks(self) -> Hull | None:
+        """Carved when the first photo without marks comes; None where too few are marked, or it is not wanted."""
+        if not self._settings.carry or len(self._marked) < _CARRY_VIEWS:
+            return None
+        if not self._carved:
+            self._hull, self._carved = carve(self._marked, self._clean, 0.0), True
+        return self._hull
+
+
+def _filled(shares: np.ndarray, view: CaptureView) -> np.ndarray:
+    """(H, W) bool: the polygon (K, 2) in shares of the photo, at its size."""
+    width, height = upright_size(view)
+    x, y = np.meshgrid((np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height)
+    return in_polygon(np.stack([x.ravel(), y.ravel()], axis=1), shares).reshape(height, width)
 
 
 def upright_size(view: CaptureView) -> tuple[int, int]:

@@ -95,7 +95,7 @@ def seen_from(pane: Pane, view: CaptureView, lens: Lens) -> np.ndarray:
     reach = np.where(np.isfinite(reach) & (reach > 0), reach, np.nan)
     first, second = basis(pane.normal)
     axes = np.stack([first, second], axis=1)
-    inside = _in_polygon((center + reach[:, None] * rays) @ axes, pane.corners @ axes)
+    inside = in_polygon((center + reach[:, None] * rays) @ axes, pane.corners @ axes)
     return inside.reshape(lens.height, lens.width)
 
 
@@ -207,7 +207,7 @@ def _around(view: CaptureView, shares: np.ndarray, points: PointCloud, grown: fl
     ahead = local[:, 2] > 1e-6
     pixels = project(view.lens, local[ahead]) / (view.lens.width, view.lens.height)
     middle = shares.mean(axis=0)
-    ring = _in_polygon(pixels, middle + (shares - middle) * grown) & ~_in_polygon(pixels, shares)
+    ring = in_polygon(pixels, middle + (shares - middle) * grown) & ~in_polygon(pixels, shares)
     return points.positions[ahead][ring]
 
 
@@ -228,7 +228,7 @@ def _plane_of(points: np.ndarray, center: np.ndarray) -> tuple[np.ndarray, np.nd
     return normal, spot, float(best.mean())
 
 
-def _in_polygon(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
+def in_polygon(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
     """(N,) bool: points (N, 2) inside a polygon (K, 2) by the even-odd rule; NaN is outside."""
     inside = np.zeros(len(points), dtype=bool)
     x, y = points[:, 0], points[:, 1]

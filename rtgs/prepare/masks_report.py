@@ -26,9 +26,9 @@ _GREEN, _YELLOW = np.array([0.1, 0.9, 0.3], np.float32), np.array([1.0, 0.9, 0.1
 METHODS = {
     "given": "given masks",
     "grounded_sam2": "GroundingDINO and SAM 2",
-    "grabcut": "GrabCut from marks of a person (classical fallback)",
+    "grabcut": "outlines of a person or GrabCut from marks (classical fallback)",
     "polygon": "flat panes drawn by a person and carried by the poses (classical fallback)",
-    "drawn": "flat panes and GrabCut from marks of a person (classical fallback)",
+    "drawn": "flat panes, outlines or GrabCut from marks of a person (classical fallback)",
 }
 
 

@@ -113,7 +113,8 @@ class DrawnSettings:
     grabcut_side: int = 600
     """Long side GrabCut works at; its time grows with the number of pixels."""
     carry: bool = True
-    """Photos without marks get theirs from the hull of the marked ones (three at least), refined by GrabCut."""
+    """Photos without marks get theirs from the hull of the marked ones (three at least): its silhouette where all are
+    outlined, else what GrabCut makes of it."""
     click_radius: float = 0.01
     """Of a click, in long sides of the photo."""
     min_angle: float = 2.0

@@ -69,9 +69,10 @@ cutouts:
             "panes: {d: {IMG_1: [[1, 2], [3, 4], [5, 6]], b/IMG_2.jpg: [[1, 2], [3, 4], [5, 6], [7, 8]]}}",
             "different numbers of corners .*same order",
         ),
-        ("cutouts: {IMG_1: {boxes: [1, 2, 3, 4]}}", "give box: "),
+        ("cutouts: {IMG_1: {boxes: [1, 2, 3, 4]}}", "give outline, box"),
         ("cutouts: {IMG_1: {box: [5, 2, 3, 4]}}", r"the box of IMG_1 is \[5.0, 2.0, 3.0, 4.0\]"),
-        ("cutouts: {IMG_1: {outside: [[1, 2]]}}", "neither a box nor a click inside"),
+        ("cutouts: {IMG_1: {outline: [[1, 2]]}}", "the outline of IMG_1 has 1 corners"),
+        ("cutouts: {IMG_1: {outside: [[1, 2]]}}", "has no outline, no box and no click inside"),
     ],
 )
 def test_a_file_of_another_form_is_a_message(tmp_path, text, message):

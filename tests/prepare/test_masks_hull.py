@@ -5,7 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rtgs.prepare.masks_hull import SmallMask, carve, common_hull, compare, limits, signed_distance, small_mask
+from rtgs.prepare.masks_hull import (
+    SmallMask,
+    carve,
+    common_hull,
+    compare,
+    find_consensus,
+    in_form,
+    limits,
+    signed_distance,
+    small_mask,
+)
 from rtgs.prepare.masks_plane import pixel_rays
 from rtgs.prepare.masks_settings import CleanSettings
 from rtgs.scenes.capture import CaptureView
@@ -75,6 +85,32 @@ def test_a_quarter_of_the_masks_may_be_wrong():
     assert hull is not None
     flagged = {index for index, mask in enumerate(given) if compare(hull, mask).value < SETTINGS.min_agreement}
     assert flagged == {1, 3, 5, 8}
+
+
+def test_what_stands_before_the_glass_makes_holes_that_are_no_mistakes():
+    """A label on one side of the ball: a band through half of the masks. One mask more is truly wrong."""
+    changed = {}
+    for index in range(0, 12, 2):
+        mask = ball_mask(poses(12)[index])
+        rows = np.nonzero(mask)[0]
+        third = np.ptp(rows) // 3
+        mask[rows.min() + third : rows.max() - third] = False
+        changed[index] = mask
+    changed[5] = np.roll(ball_mask(poses(12)[5]), 30, axis=1)
+    found = find_consensus(masks(12, changed), SETTINGS)
+    assert found is not None
+    assert found.form == "convex"
+    values = {name: agreement.value for name, agreement in found.agreement.items()}
+    assert values.pop("5") < SETTINGS.min_agreement
+    assert min(values.values()) > 0.85
+    clean = find_consensus(masks(12), SETTINGS)
+    assert clean is not None
+    assert clean.form == "filled"
+    whole = ball_mask(poses(1)[0])
+    holed = whole.copy()
+    holed[60:64, 78:84] = False
+    assert (in_form(holed, "filled") == whole).all()
+    assert not in_form(np.zeros((4, 4), dtype=bool), "convex").any()
 
 
 def test_masks_of_nothing_in_common_have_no_hull():

@@ -164,7 +164,7 @@ def test_three_boxes_are_enough_for_grabcut_on_all_photos(tmp_path):
     marks(root, cutouts={SHOTS[index].name: {"box": box_around(SHOTS[index].mask)} for index in (0, 4, 7)})
     report, out, said = make("grabcut", root, tmp_path)
     assert report.masks == 8
-    assert "by GrabCut from marks of a person (classical fallback)" in said[-1]
+    assert "GrabCut from marks (classical fallback)" in said[-1]
     assert min(overlap(read_mask(out / f"masks/{shot.name}.png"), shot.mask) for shot in SHOTS) > 0.9
     origins = {row["origin"] for row in table(out).values()}
     assert origins == {"GrabCut from marks", "GrabCut from the hull of the marked photos"}
@@ -173,6 +173,27 @@ def test_three_boxes_are_enough_for_grabcut_on_all_photos(tmp_path):
     assert report.masks == 3
     with pytest.raises(PrepareError, match="has no panes, which masks=polygon needs: set masks=grabcut"):
         make("polygon", root, tmp_path)
+
+
+def test_outlines_in_a_few_photos_give_the_others_their_hull(tmp_path):
+    """What GrabCut cannot see, a person can: colours play no part."""
+    import cv2
+
+    taken = [replace(shot, pixels=np.full_like(shot.pixels, 90)) for shot in SHOTS]
+    root = write_capture(tmp_path / "outlined", taken)
+    outlines = {}
+    for index in (0, 2, 4, 5, 7):
+        (found,), _ = cv2.findContours(SHOTS[index].mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+        corners = (found[:, 0] + 0.5) / (WIDTH, HEIGHT)
+        outlines[SHOTS[index].name] = {"outline": corners.round(4).tolist()}
+    marks(root, units="fraction", cutouts=outlines)
+    report, out, said = make("grabcut", root, tmp_path)
+    assert report.masks == 8
+    assert "outlines of a person" in said[-1]
+    values = {shot.name: overlap(read_mask(out / f"masks/{shot.name}.png"), shot.mask) for shot in SHOTS}
+    assert min(values.values()) > 0.85
+    origins = {row["origin"] for row in table(out).values()}
+    assert origins == {"outlined by a person", "hull of the outlines"}
 
 
 def test_a_pane_is_carried_into_the_scene(tmp_path):
