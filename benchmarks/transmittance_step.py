@@ -1,0 +1,110 @@
+"""What a step of the third stage costs beside one of the second: ``python -m benchmarks.transmittance_step``.
+
+Preset ``quick`` on an embedded scene of glass at 256x192, its schedule shrunk to ``--steps``. The first two stages are
+trained; from there on one copy goes on with the third stage (the true mesh of the object), one with the second, which
+traces every pixel. Both train ``--settle`` steps. Then single steps of both take turns on the same views: CPU
+milliseconds of one thread, medians, and their ratio. Last line: a JSON object.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from statistics import median
+
+import torch
+
+from benchmarks.training_runs import schedule_overrides
+from rtgs.config.compose import compose
+from rtgs.mesh.container import ObjectMesh
+from rtgs.mesh.triangles import TriangleMesh
+from rtgs.methods import Stage, create_method
+from rtgs.methods.transmittance import TransmissiveMethod
+from rtgs.scenes.scene import Scene, View, load_scene
+from rtgs.train.seeds import generator_for
+from rtgs.train.trainer import Trainer
+
+VOXELS = 96  # along the object's longest side, as the hull's
+
+
+def true_mesh(scene: str) -> ObjectMesh:
+    """The transparent shapes of a described scene."""
+    from rtgs.scenes.synthetic.description import named_scene
+    from rtgs.scenes.synthetic.geometry import build, merge
+
+    made = merge([build(shape) for shape in named_scene(scene).transparent])
+    size = float((made.vertices.max(0) - made.vertices.min(0)).max())
+    return ObjectMesh(TriangleMesh(made.vertices, made.faces), "given", size / VOXELS, flat=False)
+
+
+def trained_pair(name: str, steps: int, settle: int) -> tuple[TransmissiveMethod, TransmissiveMethod, Scene, int]:
+    """The method in its second and in its third stage from the same state; the scene; the step they are at."""
+    words = [f"scene={name}", "method=rtgs", "preset=quick", *schedule_overrides(steps, "quick")]
+    config, _ = compose([*words, "method.loss.perceptual=0"])
+    scene = replace(load_scene(config.scene), test=())
+
+    def new(mesh: ObjectMesh | None) -> TransmissiveMethod:
+        generator = generator_for(config.seed, "initialise")
+        method = create_method(config.method, scene, config.schedule, generator, mesh)
+        assert isinstance(method, TransmissiveMethod)
+        return method
+
+    first = new(None)
+    third = new(true_mesh(name))
+    boundary = third.stages[-1].from_step
+    for stage in third.stages[:-1]:
+        Trainer(first, scene, seed=config.seed, stage=stage).run()
+    third.load({key: tensor.clone() for key, tensor in first.state().items()})
+    until = boundary + settle
+    Trainer(first, scene, seed=config.seed, stage=Stage("rest", boundary, until)).run()
+    Trainer(third, scene, seed=config.seed, stage=Stage("transmittance", boundary, until)).run()
+    return first, third, scene, until
+
+
+def one_step(method: TransmissiveMethod, view: View, step: int) -> None:
+    """A step as the trainer makes it; ``step`` is odd, so that density control leaves the sets alone."""
+    rendered = method.render(view.camera, step, None, view.mask)
+    method.losses(rendered, view, step).total.backward()
+    method.after_step(step)
+
+
+def cpu_milliseconds(work: Callable[[], None]) -> float:
+    start = time.process_time()
+    work()
+    return 1000 * (time.process_time() - start)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scene", default="ball_statue")
+    parser.add_argument("--steps", type=int, default=600, help="of the shrunk schedule")
+    parser.add_argument("--settle", type=int, default=60, help="steps of both stages before timing")
+    parser.add_argument("--rounds", type=int, default=24)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    second, third, scene, step = trained_pair(options.scene, options.steps, options.settle)
+    step += 1 - step % 2
+    times: dict[str, list[float]] = {"second": [], "third": []}
+    for index in range(options.rounds):
+        view = scene.train[index % len(scene.train)]
+        for name, method in (("second", second), ("third", third)):
+            times[name].append(cpu_milliseconds(lambda m=method, v=view: one_step(m, v, step)))
+    shares = [float(view.mask.float().mean()) for view in scene.train if view.mask is not None]
+    medians = {name: round(median(found), 2) for name, found in times.items()}
+    result = {
+        "scene": options.scene,
+        "pixels": f"{scene.train[0].camera.width}x{scene.train[0].camera.height}",
+        "mask_share": round(sum(shares) / max(len(shares), 1), 3),
+        "second_stage_ms": medians["second"],
+        "third_stage_ms": medians["third"],
+        "ratio": round(medians["third"] / medians["second"], 3),
+        "surfels": {part.name: len(part) for part in third.sets},
+    }
+    print(json.dumps(result))
+
+
+if __name__ == "__main__":
+    main()
