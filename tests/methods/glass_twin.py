@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -77,7 +77,10 @@ class GlassTwin:
         parts = [self._activated(name) for name in ("base", "interface") if name in self.sets]
         surfels = [part[0] for part in parts]
         names = ("means", "tangent_u", "tangent_v", "scales", "opacities")
-        shape = [torch.cat([getattr(part, name) for part in surfels]) for name in names]
+        means, tangent_u, tangent_v, scales, opacities = (
+            torch.cat([getattr(part, name) for part in surfels]) for name in names
+        )
+        shape = (means, tangent_u, tangent_v, scales, opacities)
         features = torch.cat([part[1] for part in parts])
         options = self.method.raster_options(self.method.training_options(self.step), weight_sum=False)
         buffers = reference.rasterize_surfels(*shape, features, self.camera, options=options)
@@ -104,9 +107,9 @@ class GlassTwin:
         raw = self.sets[name]
         active = activate(raw, self.camera.center, 0)
         shape = (active.means, active.tangent_u, active.tangent_v, active.scales, active.opacities)
-        colors = {"sh_dc": raw.sh_dc, "sh_rest": raw.sh_rest}
-        self.fragile[pixels] |= fragile_rays(*shape, origins, directions, **colors, options=options)
-        return reference_trace.trace_surfels(*shape, origins, directions, **colors, options=options)
+        dc, rest = raw.sh_dc, raw.sh_rest
+        self.fragile[pixels] |= fragile_rays(*shape, origins, directions, sh_dc=dc, sh_rest=rest, options=options)
+        return reference_trace.trace_surfels(*shape, origins, directions, sh_dc=dc, sh_rest=rest, options=options)
 
     def _through(
         self, center: Tensor, rays: Tensor, near: Tensor, far: Tensor, second: Tensor, rows: Tensor
@@ -144,8 +147,3 @@ class GlassTwin:
         self.fragile[rows] |= (left.detach() - settings.opaque).abs() < 1e-4
         shown = left.detach() > settings.opaque
         return first.colors + torch.where(shown[:, None], left[:, None] * behind, 0.0), first
-
-
-def raw_fields(kind: type[Surfels]) -> list[str]:
-    """Names of a kind's parameters."""
-    return [field.name for field in fields(kind)]
