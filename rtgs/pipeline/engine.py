@@ -214,7 +214,8 @@ def _slurm(settings: EngineSettings, threads: int) -> Any:
         job_script_prologue=[f"export {key}={value}" for key, value in worker_environment(threads).items()],
         scheduler_options={"dashboard": bool(settings.dashboard)},
     )
-    cluster.scale(jobs=settings.workers)
+    # Not `scale`, which leaves a job that was cancelled or lost its node without a replacement.
+    cluster.adapt(minimum_jobs=settings.workers, maximum_jobs=settings.workers)
     return cluster
 
 
