@@ -56,6 +56,7 @@ reproduce-table2: setup ## thin glass: the same for Table 2
 	$(CHECK_DATA)
 	$(TABLE) experiment=table2 $(RUN)
 
+reproduce-table3: SCENES_nu_nerf := scene=nu_nerf/ballstatue table.data=paper
 reproduce-table3: setup ## what each part of the third stage is worth
 	$(TABLE) experiment=table3 $(RUN)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from scipy.spatial import KDTree
 from torch import Tensor
@@ -38,8 +40,8 @@ def normal_quaternions(normals: Tensor) -> Tensor:
 def interface_surfels(
     settings: MethodSettings, mesh: ObjectMesh, colors_of: Surfels, generator: torch.Generator
 ) -> MaterialSurfels:
-    """Surfels spread over the mesh, with its normals, the colour of the nearest of ``colors_of``, and the initial
-    materials but for k_s."""
+    """Surfels spread over the mesh, with its normals, the colour of the nearest of ``colors_of``, and materials of
+    their own."""
     own = settings.transmittance.interface
     points, normals = mesh.sample(own.count, generator)
     _, nearest = KDTree(colors_of.means.detach().double().numpy()).query(points.double().numpy())
@@ -52,6 +54,6 @@ def interface_surfels(
         sh_dc=colors_of.sh_dc.detach()[torch.from_numpy(nearest)].clone(),
         sh_rest=torch.zeros(len(points), rest_count(settings.init.sh_degree), 3),
     )
-    made = with_materials(plain, settings.materials)
+    made = with_materials(plain, replace(settings.materials, f0=own.f0, roughness=own.roughness))
     made.specular_logits = torch.full((len(points),), logit(own.specular))
     return made

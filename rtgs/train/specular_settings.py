@@ -109,13 +109,16 @@ class InterfaceSettings:
     floor: float = 0.9  # opacities stay at or above it: photometric training erodes glass; no resets here
     scale: float = 1.0  # times the distance to the neighbours
     specular: float = 0.9  # initial k_s: L_spec's target
+    # With both, w_r starts at 0.2, as on the base set (methods.md 4.4).
+    f0: float = 0.04  # initial
+    roughness: float = 0.005  # initial
     normal_loss: float = 0.2  # weight of 1 - n . N of the mesh in the masks: 0.01 does nothing there, 0.05 harms
     normal_loss_until: float = 1.0  # share of the run; afterwards only reflections move the normals
 
     def __post_init__(self) -> None:
         refuse_bad_numbers(self, "method.transmittance.interface")
         refuse_unless(self.count >= 0, "method.transmittance.interface.count", self.count, "at least 0 (0: none)")
-        for name in ("opacity", "floor", "specular"):
+        for name in ("opacity", "floor", "specular", "f0", "roughness"):
             value = getattr(self, name)
             refuse_unless(0 < value < 1, f"method.transmittance.interface.{name}", value, "between 0 and 1")
         refuse_unless(
