@@ -26,7 +26,7 @@ from pipelines.preparation import SkippedStep, prepare
 from pipelines.training import StageParams
 from pipelines.transparent import Transparency, find_transparency
 from rtgs.config.schema import Choices, RunConfig
-from rtgs.methods import method_stages, stage_settings
+from rtgs.methods import has_third_stage, method_stages, stage_settings
 from rtgs.pipeline import Step, StepKind
 from rtgs.pipeline.fingerprint import flatten
 from rtgs.train.settings import MethodSettings, ScheduleSettings
@@ -165,7 +165,8 @@ def _report_params(config: RunConfig, choices: Choices, skipped: tuple[SkippedSt
 
 def shown_values(config: RunConfig) -> dict[str, object]:
     """Every value that has to do with the result, by dotted key."""
-    hidden = _NOT_SHOWN if config.mesh.extract else (*_NOT_SHOWN, "mesh.")
+    meshed = config.mesh.extract or has_third_stage(config.method)
+    hidden = _NOT_SHOWN if meshed else (*_NOT_SHOWN, "mesh.")
     return {key: value for key, value in flatten(asdict(config)).items() if not key.startswith(hidden)}
 
 
