@@ -160,14 +160,20 @@ def export(artifact: Path, place: Path) -> None:
 
     Raises:
         RtgsError: something else is there.
+        OSError: a file cannot be written (disk full); what was there stays.
     """
     from rtgs.pipeline.manifest import NAME
+    from rtgs.scenes.synthetic.capture import copy_folder
 
     _check_replaceable(place)
     place.parent.mkdir(parents=True, exist_ok=True)
     fresh = place.with_name(f"{place.name}.tmp")
     shutil.rmtree(fresh, ignore_errors=True)
-    shutil.copytree(artifact, fresh, ignore=shutil.ignore_patterns(NAME))
+    try:
+        copy_folder(artifact, fresh, without=NAME)
+    except OSError:
+        shutil.rmtree(fresh, ignore_errors=True)
+        raise
     shutil.rmtree(place, ignore_errors=True)
     fresh.rename(place)
 

@@ -1,7 +1,13 @@
 """``rtgs run synthesize``: cached, resumable, and clear about what is wrong."""
 
+import ctypes.util
 import errno
 import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -160,6 +166,45 @@ def test_output_never_replaces_what_is_no_synthetic_capture(scene, tmp_path, cap
     assert artifacts(tmp_path) == []  # refused before any work
     assert "is no synthetic capture" in capsys.readouterr().err
     assert (tmp_path / "out" / "tiny" / "thesis.txt").read_text() == "years of work"
+
+
+def test_a_copy_that_meets_a_full_disk_leaves_what_was_there(scene, tmp_path, monkeypatch, capsys):
+    words = ["run", "synthesize", *scene, f"output={tmp_path / 'out'}"]
+    assert main(words) == 0
+    before = (tmp_path / "out" / "tiny" / "images" / "view_000.png").read_bytes()
+    copyfile = shutil.copyfile
+
+    def full(source, target):
+        if "truth" in str(target):
+            raise OSError(errno.ENOSPC, "No space left on device", str(target))
+        return copyfile(source, target)
+
+    monkeypatch.setattr(shutil, "copyfile", full)
+    assert main(words) == 1
+    message = capsys.readouterr().err.splitlines()[-1]
+    assert message.count("No space left on device") == 1
+    assert "free some space" in message
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["tiny"]
+    assert (tmp_path / "out" / "tiny" / "images" / "view_000.png").read_bytes() == before
+    monkeypatch.setattr(shutil, "copyfile", copyfile)
+    assert main(words) == 0
+    assert len(list((tmp_path / "out" / "tiny" / "truth" / "view_008").iterdir())) == 8
+    assert not (tmp_path / "out" / "tiny" / "manifest.json").exists()
+
+
+def test_a_library_that_is_no_llvm_is_told(tmp_path):
+    """In a process of its own: the library is loaded once for all."""
+    library = ctypes.util.find_library("m")
+    folders = ("/usr/lib/x86_64-linux-gnu", "/usr/lib/aarch64-linux-gnu", "/usr/lib64", "/lib")
+    found = [Path(folder) / str(library) for folder in folders if (Path(folder) / str(library)).is_file()]
+    if not found:
+        pytest.skip("no mathematics library in a usual place")
+    code = "from rtgs.scenes.synthetic.variants import load_mitsuba; load_mitsuba('llvm_ad_rgb')"
+    environment = os.environ | {"DRJIT_LIBLLVM_PATH": str(found[0])}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "RtgsError: Mitsuba's llvm_ad_rgb does not start with" in done.stderr
+    assert "take the variant scalar_rgb" in done.stderr
 
 
 def test_help_names_scenes_and_keys(capsys):

@@ -167,6 +167,21 @@ def _suffix(settings: CaptureSettings, index: int) -> str:
     return "png" if settings.is_test(index) else "jpg"
 
 
+def copy_folder(source: Path, target: Path, *, without: str | None = None) -> None:
+    """Copy files and subfolders into the new folder ``target``, but none called ``without``.
+
+    Raises:
+        OSError: the first file that cannot be copied (``shutil.copytree`` tries all, and lists every one).
+    """
+    target.mkdir(parents=True)
+    for path in sorted(source.rglob("*")):
+        place = target / path.relative_to(source)
+        if path.is_dir():
+            place.mkdir()
+        elif path.name != without:
+            shutil.copyfile(path, place)
+
+
 def _assemble(
     tracer: PathTracer,
     views: list[Camera],
@@ -181,7 +196,7 @@ def _assemble(
             if side := _SIDES.get(path.stem):
                 place = folder / side / f"{camera.name}{path.suffix}"
                 place.parent.mkdir(parents=True, exist_ok=True)
-                (shutil.copytree if path.is_dir() else shutil.copyfile)(path, place)
+                (copy_folder if path.is_dir() else shutil.copyfile)(path, place)
     pictures = [
         PictureView(
             camera,

@@ -6,9 +6,12 @@ Frame: right-handed, z up, metres. Nothing here needs the renderer; see ``render
 from __future__ import annotations
 
 import tomllib
-from dataclasses import dataclass, field, fields
+from collections import Counter
+from dataclasses import MISSING, dataclass, field, fields
+from math import isfinite
 from pathlib import Path
-from typing import Any, TypeVar
+from types import UnionType
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 SCENES = Path(__file__).parent / "scenes"
 
@@ -114,16 +117,82 @@ T = TypeVar("T")
 
 
 def _build(cls: type[T], values: dict[str, Any], where: str) -> T:
-    """A dataclass from a TOML table; an unknown key stops with its name and place."""
-    known = {f.name for f in fields(cls)}  # type: ignore[arg-type]
-    unknown = sorted(set(values) - known)
+    """A dataclass from a TOML table; an unknown key, a missing one, a value of another kind stops with its place."""
+    known = get_type_hints(cls)
+    unknown = sorted(set(values) - set(known))
     if unknown:
         raise ValueError(f"{where}: unknown key {unknown[0]!r}; known keys are {', '.join(sorted(known))}")
+    for item in fields(cls):  # type: ignore[arg-type]
+        if item.default is MISSING and item.default_factory is MISSING and item.name not in values:
+            raise ValueError(f"{where}: the key {item.name!r} is missing")
 
     def frozen(value: Any) -> Any:
         return tuple(frozen(v) for v in value) if isinstance(value, list) else value
 
-    return cls(**{key: frozen(value) for key, value in values.items()})
+    given = {key: frozen(value) for key, value in values.items()}
+    for key, value in given.items():
+        if not _fits(value, known[key]):
+            raise ValueError(f"{where}: {key} = {values[key]!r} does not fit, give {_in_words(known[key])}")
+    return cls(**given)
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Whether a value out of a TOML file is what a field's type says; whole numbers are numbers, infinities are not."""
+    inner = get_args(hint)
+    if isinstance(hint, UnionType):
+        return any(_fits(value, one) for one in inner)
+    if get_origin(hint) is tuple:
+        if not isinstance(value, tuple):
+            return False
+        kinds = inner[:1] * len(value) if inner[-1] is Ellipsis else inner
+        return len(kinds) == len(value) and all(_fits(one, kind) for one, kind in zip(value, kinds))
+    if hint is float:
+        return isinstance(value, (int, float)) and not isinstance(value, bool) and isfinite(value)
+    return isinstance(value, hint) and (hint is bool or not isinstance(value, bool))
+
+
+def _in_words(hint: Any) -> str:
+    inner = get_args(hint)
+    if isinstance(hint, UnionType):
+        return _in_words(inner[0])
+    if get_origin(hint) is not tuple:
+        return {str: "a text", bool: "true or false", int: "a whole number", float: "a number"}.get(hint, "a table")
+    if inner[-1] is Ellipsis:
+        return f"a list, each of it {_in_words(inner[0])}"
+    return f"a list of {len(inner)} numbers"
+
+
+_SIZES_USED = {"box": 3, "plane": 2, "sphere": 1, "dome": 1, "knot": 1, "kernels": 1}  # the first so many of ``size``
+
+
+def _check_positive(where: str, **values: float) -> None:
+    for name, value in values.items():
+        if value <= 0:
+            raise ValueError(f"{where}: {name} = {value:g} must be more than 0")
+
+
+def _check_shape(shape: Shape, where: str) -> None:
+    _check_choice(shape.glow, TEXTURES, where + ", glow")
+    _check_choice(shape.kind, KINDS, where + ", kind")
+    for axis in range(_SIZES_USED.get(shape.kind, 0)):
+        _check_positive(where, **{f"size[{axis}]": shape.size[axis]})
+    _check_positive(where, count=shape.count, cell=shape.cell, arc=shape.arc, relief_size=shape.relief_size)
+    if shape.kind == "lathe" and len(shape.profile) < 2:
+        raise ValueError(f"{where}: a lathe needs a profile of at least two (radius, height) pairs")
+    if shape.kind == "sculpt" and not shape.parts:
+        raise ValueError(f"{where}: a sculpt needs at least one [[shape.part]]")
+    if shape.kind == "kernels" and len(shape.profile) < 2:
+        raise ValueError(f"{where}: kernels need the profile of their heap, (radius, height) pairs")
+
+
+def _check_viewpoints(viewpoints: Viewpoints, where: str) -> None:
+    nearest, angle = min(viewpoints.radius), viewpoints.field_of_view
+    _check_positive(where, count=viewpoints.count, rings=viewpoints.rings, radius=nearest, field_of_view=angle)
+    if angle >= 180:
+        raise ValueError(f"{where}: field_of_view = {angle:g} must be below 180 degrees")
+    steepest = max(abs(elevation) for elevation in viewpoints.elevation)
+    if steepest >= 90:
+        raise ValueError(f"{where}: elevation = {steepest:g} must be below 90 degrees, where up has no direction")
 
 
 def _check_choice(value: str, allowed: tuple[str, ...], where: str) -> None:
@@ -133,33 +202,50 @@ def _check_choice(value: str, allowed: tuple[str, ...], where: str) -> None:
 
 def read_description(path: Path) -> SceneDescription:
     """Read and check one scene file. Raises ValueError naming file, shape and key."""
-    with open(path, "rb") as file:
-        data = tomllib.load(file)
-    shapes = []
-    for values in data.pop("shape", []):
-        where = f"{path.name}, shape {values.get('name', '?')!r}"
-        material = _build(Material, values.pop("material", {}), where + ", material")
-        _check_choice(material.kind, MATERIALS, where + ", material.kind")
-        _check_choice(material.texture, TEXTURES, where + ", material.texture")
-        parts = tuple(_build(Part, part, where + ", part") for part in values.pop("part", []))
-        for part in parts:
-            _check_choice(part.form, FORMS, where + ", part.form")
-        shape = _build(Shape, {**values, "material": material, "parts": parts}, where)
-        _check_choice(shape.glow, TEXTURES, where + ", glow")
-        _check_choice(shape.kind, KINDS, where + ", kind")
-        if shape.kind == "lathe" and len(shape.profile) < 2:
-            raise ValueError(f"{where}: a lathe needs a profile of at least two (radius, height) pairs")
-        if shape.kind == "sculpt" and not shape.parts:
-            raise ValueError(f"{where}: a sculpt needs at least one [[shape.part]]")
-        if shape.kind == "kernels" and len(shape.profile) < 2:
-            raise ValueError(f"{where}: kernels need the profile of their heap, (radius, height) pairs")
-        shapes.append(shape)
+    try:
+        with open(path, "rb") as file:
+            data = tomllib.load(file)
+    except ValueError as error:  # also bytes that are no text
+        raise ValueError(f"scene file {path} is no TOML ({error}): mend it there") from error
+    shapes = [_read_shape(values, path.name) for values in _tables(data, "shape", path.name)]
     if not shapes:
         raise ValueError(f"{path.name}: no [[shape]] in the file")
-    viewpoints = _build(Viewpoints, data.pop("viewpoints", {}), f"{path.name}, viewpoints")
+    twice = [name for name, number in Counter(shape.name for shape in shapes).items() if number > 1]
+    if twice:
+        raise ValueError(f"{path.name}: more than one shape is called {twice[0]!r}, give each a name of its own")
+    where = f"{path.name}, viewpoints"
+    viewpoints = _build(Viewpoints, _table(data.pop("viewpoints", {}), where), where)
+    _check_viewpoints(viewpoints, where)
     return _build(
         SceneDescription, {**data, "name": path.stem, "shapes": tuple(shapes), "viewpoints": viewpoints}, path.name
     )
+
+
+def _read_shape(values: dict[str, Any], file: str) -> Shape:
+    where = f"{file}, shape {values.get('name', '?')!r}"
+    material = _build(Material, _table(values.pop("material", {}), where + ", material"), where + ", material")
+    _check_choice(material.kind, MATERIALS, where + ", material.kind")
+    _check_choice(material.texture, TEXTURES, where + ", material.texture")
+    parts = tuple(_build(Part, part, where + ", part") for part in _tables(values, "part", where))
+    for part in parts:
+        _check_choice(part.form, FORMS, where + ", part.form")
+    shape = _build(Shape, {**values, "material": material, "parts": parts}, where)
+    _check_shape(shape, where)
+    return shape
+
+
+def _table(value: Any, where: str) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise ValueError(f"{where}: {value!r} is no table of keys and values")
+    return value
+
+
+def _tables(data: dict[str, Any], key: str, where: str) -> list[dict[str, Any]]:
+    """The tables [[key]] taken out of ``data``."""
+    found = data.pop(key, [])
+    if not isinstance(found, list):
+        raise ValueError(f"{where}: {key} = {found!r} is no list of tables, write [[{key}]] above each")
+    return [_table(one, f"{where}, {key}") for one in found]
 
 
 def list_scenes() -> list[str]:

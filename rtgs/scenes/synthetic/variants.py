@@ -48,7 +48,7 @@ def load_mitsuba(variant: str | None = None) -> Any:
     """Import Mitsuba and make ``variant`` (None: :func:`choose_variant`) the current one.
 
     Raises:
-        RtgsError: Mitsuba is not installed, or the LLVM variant is wanted and there is no LLVM.
+        RtgsError: Mitsuba is not installed, or the LLVM variant is wanted and there is no LLVM, or one it refuses.
     """
     llvm = find_llvm()
     if llvm is not None:
@@ -63,5 +63,11 @@ def load_mitsuba(variant: str | None = None) -> Any:
         import mitsuba
     except ImportError as error:
         raise RtgsError("path tracing needs Mitsuba 3: pip install 'rtgs[synthetic]'") from error
-    mitsuba.set_variant(chosen)
+    try:
+        mitsuba.set_variant(chosen)
+    except ImportError as error:
+        raise RtgsError(
+            f"Mitsuba's {chosen} does not start with {llvm} ({error}): set DRJIT_LIBLLVM_PATH to another LLVM, or take "
+            f"the variant {SCALAR_VARIANT}"
+        ) from error
     return mitsuba

@@ -71,3 +71,44 @@ def test_parts_are_checked(tmp_path):
         read_description(write(tmp_path, shape + '[[shape.part]]\nform = "cube"\n'))
     with pytest.raises(ValueError, match="part: unknown key 'sise'"):
         read_description(write(tmp_path, shape + "[[shape.part]]\nsise = [1, 1, 1]\n"))
+
+
+BALL = 'title = "x"\n[[shape]]\nname = "a"\nkind = "sphere"\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('title = "x', r"scene file .*scene\.toml is no TOML .Unterminated string"),
+        ('title = "x"\n[[shape]]\nname = "a"\n', r"scene.toml, shape 'a': the key 'kind' is missing"),
+        ('[[shape]]\nname = "a"\nkind = "sphere"\n', r"scene.toml: the key 'title' is missing"),
+        ('title = "x"\nshape = 3\n', r"shape = 3 is no list of tables, write \[\[shape\]\] above each"),
+        (BALL + "material = 3\n", r"shape 'a', material: 3 is no table"),
+        (
+            BALL + 'size = ["a", 1.0, 1.0]\n',
+            r"shape 'a': size = \['a', 1.0, 1.0\] does not fit, give a list of 3 numbers",
+        ),
+        (BALL + "size = [1.0]\n", r"shape 'a': size = \[1.0\] does not fit"),
+        (BALL + "turn = true\n", r"shape 'a': turn = True does not fit, give a number"),
+        (BALL + "turn = nan\n", r"shape 'a': turn = nan does not fit"),
+        (BALL + "inward = 1\n", r"shape 'a': inward = 1 does not fit, give true or false"),
+        (BALL + "emission = 3.0\n", r"shape 'a': emission = 3.0 does not fit, give a list of 3 numbers"),
+        (BALL + "profile = [[1.0]]\n", r"give a list, each of it a list of 2 numbers"),
+        (BALL + "size = [0.0, 1.0, 1.0]\n", r"shape 'a': size\[0\] = 0 must be more than 0"),
+        (BALL + '[[shape]]\nname = "a"\nkind = "box"\n', r"more than one shape is called 'a'"),
+        (BALL + "[viewpoints]\ncount = 0\n", r"scene.toml, viewpoints: count = 0 must be more than 0"),
+        (BALL + "[viewpoints]\nfield_of_view = 180.0\n", r"field_of_view = 180 must be below 180"),
+        (BALL + "[viewpoints]\nelevation = [10.0, 90.0]\n", r"elevation = 90 must be below 90"),
+    ],
+)
+def test_what_does_not_describe_a_scene_is_refused_with_its_place(text, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        read_description(write(tmp_path, text))
+
+
+def test_whole_numbers_are_numbers_and_bytes_are_no_text(tmp_path):
+    assert read_description(write(tmp_path, BALL + "size = [2, 1, 1]\n")).shapes[0].size == (2, 1, 1)
+    path = tmp_path / "bytes.toml"
+    path.write_bytes(b"\xff\xfe")
+    with pytest.raises(ValueError, match=r"bytes\.toml is no TOML"):
+        read_description(path)
