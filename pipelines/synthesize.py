@@ -23,6 +23,7 @@ HELP = """rtgs run synthesize scene=NAME[,NAME...]|all|FILE.toml [key=value ...]
 Path-traces described scenes into COLMAP captures with masks, normals and truth; needs the extra 'synthetic'.
 A finished capture is kept in the store; a killed run goes on with the views it lacks.
 """
+_BAR_STEPS = 1000
 _LINE_EVERY = 10.0  # seconds between lines where there is no terminal
 
 log = logging.getLogger("rtgs")
@@ -214,8 +215,9 @@ class BarDisplay:
     def update(self, what: str, share: float) -> None:
         if self._task is None:
             self._bar.start()
-            self._task = self._bar.add_task(what, total=1.0, completed=share)  # views done earlier are no speed
-        self._bar.update(self._task, description=what, completed=share)
+            earlier = round(_BAR_STEPS * share)  # views done earlier are no speed
+            self._task = self._bar.add_task(what, total=_BAR_STEPS, completed=earlier)
+        self._bar.update(self._task, description=what, completed=_BAR_STEPS * share)
 
     def close(self) -> None:
         self._bar.stop()
