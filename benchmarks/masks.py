@@ -31,12 +31,7 @@ from rtgs.scenes.importers import read_capture
 from rtgs.scenes.settings import SceneSettings
 
 SCENES = ("ball_statue", "popcorn_cup", "real_bottle", "tall_bottle")
-CLOCK_DOOR = {  # corners of the lower glass of the real capture glass_clock, drawn by hand to a pixel or two
-    "watch_01.jpg": [[300, 502], [440, 479], [444, 612], [301, 678]],
-    "watch_05.jpg": [[171, 482], [415, 483], [420, 670], [171, 647]],
-    "watch_20.jpg": [[299, 306], [445, 388], [461, 534], [297, 484]],
-    "watch_30.jpg": [[187, 498], [436, 549], [420, 703], [185, 638]],
-}
+CLOCK_MARKS = Path(__file__).with_name("glass_clock_marks.yaml")
 
 
 @dataclass(frozen=True)
@@ -163,9 +158,10 @@ def outlined(scene: str, truth: dict[str, np.ndarray], folder: Path) -> float:
 
 
 def clock_door() -> dict[str, float]:
-    """Pixels between drawn and carried corners in photos that a fit did not see: from every two of four, and from one."""
+    """Pixels between drawn and carried corners in photos that a fit did not see: from every two of four, from one."""
     import itertools
 
+    from rtgs.prepare.masks_drawn import read_drawing
     from rtgs.prepare.masks_plane import fit_pane
     from rtgs.scenes.undistort import project
 
@@ -173,7 +169,8 @@ def clock_door() -> dict[str, float]:
     capture = read_capture(SceneSettings(path=str(shared / "data/glass_clock")))
     views = {view.name: view for view in capture.views}
     size = {name: np.array([lens.width, lens.height]) for name, view in views.items() if (lens := view.lens)}
-    drawn = {name: np.array(corners) / size[name] for name, corners in CLOCK_DOOR.items()}
+    marks = read_drawing(CLOCK_MARKS, views).panes["door"]
+    drawn = {name: corners / size[name] for name, corners in marks.items()}
     errors: dict[int, list[float]] = {1: [], 2: []}
     for count in errors:
         for names in itertools.combinations(drawn, count):
@@ -182,7 +179,7 @@ def clock_door() -> dict[str, float]:
                 view = views[name]
                 assert view.lens is not None
                 carried = project(view.lens, pane.corners @ view.rotation.T + view.translation)
-                errors[count].append(float(np.linalg.norm(carried - CLOCK_DOOR[name], axis=1).mean()))
+                errors[count].append(float(np.linalg.norm(carried - marks[name], axis=1).mean()))
     return {
         "two_photos_mean": float(np.mean(errors[2])),
         "two_photos_worst": max(errors[2]),

@@ -158,10 +158,10 @@ def _marks_digest(config: RunConfig, method: str, folder: Path) -> str:
         return ""
     if method == "given":
         place = folder / (settings.given.folder or config.scene.masks_dir or "masks")
-        return files_digest("given", folder, sorted(path for path in place.rglob("*") if path.is_file()))
+        return files_digest("given", place, sorted(path for path in place.rglob("*") if path.is_file()))
     marks = folder / settings.drawn.file
     if not marks.is_file():
         from rtgs.prepare.masks_drawn import drawn_kinds
 
         drawn_kinds(marks)  # raises: says how to write it
-    return files_digest("marks", folder, [marks])
+    return files_digest("marks", marks.parent, [marks])

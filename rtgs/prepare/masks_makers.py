@@ -372,8 +372,11 @@ class DrawnMaker(_PlainMaker):
 def _filled(shares: np.ndarray, view: CaptureView) -> np.ndarray:
     """(H, W) bool: the polygon (K, 2) in shares of the photo, at its size."""
     width, height = upright_size(view)
-    x, y = np.meshgrid((np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height)
-    return in_polygon(np.stack([x.ravel(), y.ravel()], axis=1), shares).reshape(height, width)
+    across = (np.arange(width) + 0.5) / width
+    rows = [
+        in_polygon(np.column_stack([across, np.full(width, (row + 0.5) / height)]), shares) for row in range(height)
+    ]
+    return np.array(rows)
 
 
 def upright_size(view: CaptureView) -> tuple[int, int]:
