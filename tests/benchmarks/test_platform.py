@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+import logging
 import sys
 
-from benchmarks import plan
+import pytest
+
+from benchmarks import plan, tracking
 
 
 def last_line(module, monkeypatch, capsys, *words: str) -> dict:
@@ -21,3 +24,14 @@ def test_plan(monkeypatch, capsys):
     assert figures["steps"] == 2 * (1 + 3 * 4)  # the import is shared by three seeds
     assert figures["jobs"] == 6
     assert all(figures[key] >= 0 for key in ("warm_s", "one_key_changed_s", "cold_s", "graphs_s", "find_s"))
+
+
+def test_tracking(monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    handlers, level = logging.root.handlers[:], logging.root.level
+    words = ("scene.long_side=32", "method.density.max_surfels=500", "scene.random_points=200", "scene.points=random")
+    figures = last_line(tracking, monkeypatch, capsys, "--steps", "150", *tracking.WORDS, *words)
+    logging.root.handlers[:], logging.root.level = handlers, level
+    assert figures["metric_calls"] == 3
+    assert 0 < figures["share"] < 1
+    assert figures["share"] == pytest.approx(figures["share_metrics"] + figures["share_pictures"], abs=1e-4)
