@@ -238,7 +238,7 @@ def _match(
 
 
 def _map(photos: PhotoSet, place: Workplace, settings: SfmSettings, say: Say) -> tuple[list[Any], float]:
-    """COLMAP's models, most photos first, of the attempt whose largest is largest; demands fall until it is enough."""
+    """COLMAP's models, most photos first, of the best attempt; demands fall until one is good."""
     ticker = Ticker(say, "photos with a pose", len(photos.photos))
     best: list[Any] = []
     for trial in range(settings.mapping.init_trials):
@@ -249,13 +249,25 @@ def _map(photos: PhotoSet, place: Workplace, settings: SfmSettings, say: Say) ->
         else:
             models = _incremental(place, settings, 0.5**trial, ticker)
         models = [model for model in models if model.num_reg_images() >= settings.mapping.min_model]
-        models.sort(key=lambda model: -model.num_reg_images())
-        if models and (not best or models[0].num_reg_images() > best[0].num_reg_images()):
+        models.sort(key=_size, reverse=True)
+        if models and (not best or _size(models[0]) > _size(best[0])):
             best = models
-        enough = settings.good_registered * len(photos.photos)
-        if settings.mapping.mapper == "global" or (best and best[0].num_reg_images() >= enough):
+        if settings.mapping.mapper == "global" or (best and _is_good(best[0], photos, settings)):
             break
     return best, ticker.took
+
+
+def _size(model: Any) -> tuple[int, int]:
+    """Photos, then observations: what attempts are compared by."""
+    return model.num_reg_images(), model.compute_num_observations()
+
+
+def _is_good(model: Any, photos: PhotoSet, settings: SfmSettings) -> bool:
+    """Is another attempt not worth its time?"""
+    wanted = settings.mapping
+    longest = max(max(camera.width, camera.height) for camera in model.cameras.values())
+    error = model.compute_mean_reprojection_error() * 800 / longest
+    return model.num_reg_images() >= wanted.enough * len(photos.photos) and error <= wanted.good_error
 
 
 def _incremental(place: Workplace, settings: SfmSettings, leniency: float, ticker: Ticker) -> list[Any]:

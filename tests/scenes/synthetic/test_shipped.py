@@ -45,3 +45,16 @@ def test_a_view_rendered_again_is_the_shipped_one(folder):
         error, noise = (first + second) / 2 - expected, np.mean((first - second) ** 2) / 4
         assert np.mean(error**2) <= 1.5 * noise + AVERAGING**2, layer
         assert abs(error.mean()) <= SHIFT * expected.mean() + 3 * np.sqrt(noise / len(error)), layer
+
+
+def test_the_shipped_set_stays_small():
+    size = sum(file.stat().st_size for folder in synthetic_captures() for file in folder.rglob("*") if file.is_file())
+    assert len(synthetic_captures()) == 9
+    assert size <= 30e6, "make the capture again, or smaller: it is part of every clone"
+
+
+@pytest.mark.parametrize("folder", synthetic_captures(), ids=lambda folder: folder.name)
+def test_test_images_are_close_to_converged(folder):
+    record = CaptureRecord.read(folder)
+    assert record is not None
+    assert record.noise_psnr_worst >= 38
