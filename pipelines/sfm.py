@@ -78,7 +78,7 @@ def sfm(params: SfmParams, context: StepContext) -> None:
 
 STEP = StepKind(
     "sfm",
-    3,
+    4,
     sfm,
     helpers=(
         "rtgs.prepare.poses",
