@@ -109,8 +109,8 @@ class InterfaceSettings:
     floor: float = 0.9  # opacities stay at or above it: photometric training erodes glass; no resets here
     scale: float = 1.0  # times the distance to the neighbours
     specular: float = 0.9  # initial k_s: L_spec's target
-    # With both, w_r starts at 0.2, as on the base set (methods.md 4.4).
-    f0: float = 0.04  # initial
+    # With both, w_r starts near 0.8 (base set: 0.2, methods.md 4.4): bright reflections form within a short run.
+    f0: float = 0.15  # initial; against 0.04: docs/transmittance.md
     roughness: float = 0.005  # initial
     normal_loss: float = 0.2  # weight of 1 - n . N of the mesh in the masks: 0.01 does nothing there, 0.05 harms
     normal_loss_until: float = 1.0  # share of the run; afterwards only reflections move the normals
