@@ -1,0 +1,216 @@
+"""The visual hull of the transparent object, carved from its masks.
+
+A point belongs to the object when every view that has it in the picture shows it inside the mask (Laurentini 1994).
+Here with signed distances to the outlines, so that the surface is found between the voxels, and with the (k+1)-th
+smallest over the views instead of the smallest, so that k broken masks carve nothing away.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rtgs.errors import RtgsError
+from rtgs.mesh.grid import Grid, bounding_grid, refined, tightened
+from rtgs.mesh.outlines import MaskField, Outline, first_outlines, plain_outlines, refined_outlines
+from rtgs.mesh.silhouettes import MaskSet, MaskView, focus_point, silhouette_score
+from rtgs.mesh.smoothing import main_pieces, surface_of_field, taubin
+from rtgs.mesh.triangles import TriangleMesh
+
+AUTOMATIC = -1
+_MOST_OUTVOTED = 4  # masks: more dilates the hull visibly
+_VIEWS_PER_OUTVOTED = 8  # each costs sharpness: one for so many views
+_TRIAL_VOXELS = 48  # of the hulls among which the automatic k chooses
+_GENEROUS = 4  # the first rough hull lets one view in so many be wrong
+_TRIAL_STRIDE = 3  # pixels
+
+
+@dataclass(frozen=True)
+class HullSettings:
+    """Numbers of the carving; measured in docs/mesh.md."""
+
+    voxels: int = 96  # along the longest side of the object
+    outvoted: int = AUTOMATIC  # k: masks that may be wrong about a point; -1: what agrees best with most masks
+    tie: float = 0.004  # a larger k must raise the median silhouette IoU by more than this
+    explained: float = 0.98  # median IoU from which on nothing opaque is thought to hide parts of the object
+    min_seen: float = 0.25  # share of the views that must have a point in the picture for it to belong to the object
+    smoothing: int = 10  # iterations of Taubin's filter
+    trim: bool = True  # cut off what the base set's depth shows to lie behind other surfaces (the unseen bottom)
+    trim_views: int = 8  # views in front of whose depth a point must lie to stay
+    trim_margin: float = 0.5  # voxels that it may lie behind it
+    min_piece: float = 0.05  # pieces with a smaller share of the largest one's volume go
+    min_views: int = 12  # masks; with fewer the hull is not chosen by mesh.source = auto
+    min_spread: float = 60.0  # degrees between the two farthest views; with less the hull is not chosen either
+
+
+@dataclass(frozen=True)
+class HullResult:
+    """A carved hull and how it came about."""
+
+    mesh: TriangleMesh
+    voxel: float
+    outvoted: int  # k
+    medians: tuple[float, ...]  # median IoU of the hulls among which k was chosen, for k = 0, 1, ...; one: k was given
+    trimmed: float | None  # share of the volume that was cut off; None: not tried
+    note: str  # why it was not trimmed, if so
+    pieces: int  # connected ones before the small ones went
+    kept: int
+    hidden: tuple[Tensor, ...]  # (H, W) bool for each mask: pixels at which something opaque may hide the object
+
+
+def carve_hull(masks: MaskSet, settings: HullSettings = HullSettings()) -> HullResult:
+    """The visual hull of the masks, smoothed; where the views have depth, trimmed, and not carved by what hides it.
+
+    Raises:
+        RtgsError: the masks bound no finite volume, or carve everything away.
+    """
+    most = most_outvoted(len(masks.views)) if settings.outvoted == AUTOMATIC else settings.outvoted
+    if not 0 <= most < len(masks.views):
+        raise RtgsError(f"mesh.hull.outvoted is {settings.outvoted}, there are {len(masks.views)} usable masks")
+    outlines = first_outlines(masks.views)
+    field = MaskField(outlines, settings.min_seen)
+    center, radius = focus_point(masks.views), _first_radius(masks.views)
+    grid = bounding_grid(field.distance(most), center, radius)
+    if any(view.depth is not None for view in masks.views) and not _explained(field, grid, most, settings):
+        for generous in (len(masks.views) // _GENEROUS, most):
+            rough = _rough_hull(field, grid, generous, settings)
+            if len(rough.faces):
+                field = MaskField(refined_outlines(outlines, rough), settings.min_seen)
+    else:
+        field = MaskField(plain_outlines(masks.views), settings.min_seen)
+    return _carved(field, grid, most, settings)
+
+
+def _explained(field: MaskField, grid: Grid, most: int, settings: HullSettings) -> bool:
+    """The masks alone explain themselves: nothing opaque stands before the object, or only in few views."""
+    plain = MaskField(plain_outlines([item.view for item in field.outlines]), settings.min_seen)
+    trials = _trials(plain, tightened(plain.distance(most), grid), most, settings)
+    _, medians = _choose_outvoted(trials, plain.outlines, settings.tie)
+    return max(medians) >= settings.explained
+
+
+def _rough_hull(field: MaskField, grid: Grid, outvoted: int, settings: HullSettings) -> TriangleMesh:
+    trial = grid.resampled(min(_TRIAL_VOXELS, settings.voxels))
+    values = refined(field.distance(outvoted), trial)
+    values, _, _ = _trimmed(values, trial, [item.view for item in field.outlines], settings)
+    return surface_of_field(values, trial.origin, trial.voxel)
+
+
+def _carved(field: MaskField, grid: Grid, most: int, settings: HullSettings) -> HullResult:
+    outvoted, medians = most, ()
+    if settings.outvoted == AUTOMATIC:
+        trials = _trials(field, tightened(field.distance(most), grid), most, settings)
+        outvoted, medians = _choose_outvoted(trials, field.outlines, settings.tie)
+    distance = field.distance(outvoted)
+    fine = tightened(distance, tightened(distance, grid)).resampled(settings.voxels)
+    values, trimmed, note = _trimmed(refined(distance, fine), fine, [item.view for item in field.outlines], settings)
+    mesh, pieces, kept = main_pieces(surface_of_field(values, fine.origin, fine.voxel), settings.min_piece)
+    if len(mesh.faces) == 0:
+        raise RtgsError(
+            f"the {len(field.outlines)} masks carve everything away (k = {outvoted}): they do not show one rigid "
+            "object, or poses and masks do not belong together; look at the masks, or raise mesh.hull.outvoted"
+        )
+    smooth = taubin(mesh, settings.smoothing)
+    hidden = tuple(outline.hidden for outline in field.outlines)
+    return HullResult(smooth, fine.voxel, outvoted, medians, trimmed, note, pieces, kept, hidden)
+
+
+def most_outvoted(views: int) -> int:
+    """The largest k that so many masks allow."""
+    return min(_MOST_OUTVOTED, views // _VIEWS_PER_OUTVOTED)
+
+
+def _first_radius(views: Sequence[MaskView]) -> float:
+    """World units: about half the object's size, from the masks' boxes at the distance of their common middle."""
+    point = torch.from_numpy(focus_point(views))
+    sizes = []
+    for view in views:
+        depth = float(view.camera.to_camera(point)[2])
+        rows, columns = int(view.mask.any(1).sum()), int(view.mask.any(0).sum())
+        sizes.append(abs(depth) * np.hypot(rows / view.camera.fy, columns / view.camera.fx) / 2)
+    return float(np.median(sizes))
+
+
+def _trials(field: MaskField, grid: Grid, most: int, settings: HullSettings) -> list[TriangleMesh]:
+    """The rough hulls for k = 0 to ``most``."""
+    trial = grid.resampled(min(_TRIAL_VOXELS, settings.voxels))
+    values = field.outvoting(trial.points().reshape(-1, 3), range(most + 1)).reshape(most + 1, *trial.shape)
+    return [surface_of_field(candidate, trial.origin, trial.voxel) for candidate in values]
+
+
+def _choose_outvoted(
+    trials: Sequence[TriangleMesh], outlines: Sequence[Outline], tie: float
+) -> tuple[int, tuple[float, ...]]:
+    """The smallest k whose hull agrees with most masks, and the median IoU of every k.
+
+    The median, because masks that are wrong disagree with the right hull.
+    """
+    views, hidden = [item.view for item in outlines], [item.hidden for item in outlines]
+    medians = [
+        silhouette_score(mesh, views, hidden, _TRIAL_STRIDE).median if len(mesh.faces) else 0.0 for mesh in trials
+    ]
+    chosen = 0
+    for k in range(1, len(medians)):
+        if medians[k] > medians[chosen] + tie:
+            chosen = k
+    return chosen, tuple(medians)
+
+
+def _trimmed(
+    values: np.ndarray, grid: Grid, views: Sequence[MaskView], settings: HullSettings
+) -> tuple[np.ndarray, float | None, str]:
+    """The field without what lies behind the base set's surfaces in too many views; share removed; why not, if so.
+
+    Contents of the container are behind their own surfaces too, and stay: what is cut off is what lies outside the
+    convex hull of the points that are seen to be free.
+    """
+    from scipy.ndimage import binary_erosion, uniform_filter
+
+    deep = [view for view in views if view.depth is not None]
+    if not settings.trim:
+        return values, None, "mesh.hull.trim is off"
+    if len(deep) < 2 * settings.trim_views:
+        return values, None, f"{len(deep)} views have depth, too few for mesh.hull.trim_views = {settings.trim_views}"
+    inside = values > 0
+    points = grid.points()[inside]
+    free = np.zeros(len(points), np.int64)
+    for view in deep:
+        free += _in_front(view, torch.from_numpy(points), settings.trim_margin * grid.voxel)
+    seen = np.zeros(values.shape, bool)
+    seen[inside] = free >= settings.trim_views
+    seen &= uniform_filter(seen.astype(np.float32), 3, mode="constant") > 0.13  # lone voxels are noise
+    if seen.sum() < 0.1 * inside.sum():
+        return values, None, "the base set's depth lies in front of nearly all of the hull"
+    near = (values > -2 * grid.voxel) & ~binary_erosion(seen)
+    result = values.copy()
+    result[near] = np.minimum(values[near], _convex_distance(grid.points()[near], grid.points()[seen], grid.voxel))
+    return result, 1 - float((result > 0).sum() / inside.sum()), ""
+
+
+def _in_front(view: MaskView, points: Tensor, margin: float) -> np.ndarray:
+    """(N,) bool: the view shows something transparent at the point's pixel, and the point lies in front of the base
+    set's surface there, or there is none."""
+    camera = view.camera
+    pixels, depth = camera.project(points)
+    column, row = pixels[:, 0].floor(), pixels[:, 1].floor()
+    framed = (depth > 0) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+    index = torch.where(framed, row * camera.width + column, 0.0).long()
+    assert view.depth is not None
+    surface = view.depth.reshape(-1)[index].double()
+    free = (surface <= 0) | (depth < surface + margin)
+    return (framed & view.mask.reshape(-1)[index] & free).numpy()
+
+
+def _convex_distance(points: np.ndarray, centres: np.ndarray, voxel: float) -> np.ndarray:
+    """(N,) distance of points to the convex hull of voxel centres, grown by half a voxel; positive inside."""
+    from scipy.spatial import ConvexHull
+
+    planes = np.unique(ConvexHull(centres).equations.round(6), axis=0)
+    outside = np.full(len(points), -np.inf)
+    for plane in planes:
+        np.maximum(outside, points @ plane[:3] + plane[3], out=outside)
+    return (0.5 * voxel - outside).astype(np.float32)

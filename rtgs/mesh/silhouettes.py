@@ -1,0 +1,157 @@
+"""The transparent object's masks, and how well a mesh's silhouette agrees with them: needs no truth, so that real
+captures have this figure too."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rtgs.cameras import Camera
+from rtgs.errors import RtgsError
+from rtgs.mesh.guide import MeshGuide
+from rtgs.mesh.triangles import TriangleMesh
+
+_COVERED = 0.999  # share of the picture from which on a mask says that everything is the object
+
+
+@dataclass(frozen=True)
+class MaskView:
+    """Where one camera sees the object."""
+
+    camera: Camera
+    mask: Tensor  # (H, W) bool
+    depth: Tensor | None = None  # (H, W) z-depth of the base set (median); 0 where there is nothing
+
+    @property
+    def cut(self) -> bool:
+        """The object reaches the image border."""
+        mask = self.mask
+        return bool(mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any())
+
+
+@dataclass(frozen=True)
+class MaskSet:
+    """The masks that tell something, and what was wrong with the others."""
+
+    views: tuple[MaskView, ...]
+    without: int  # views that have no mask
+    empty: int  # masks without a pixel: the object is out of the picture, or was not found; they do not carve
+    full: int  # masks that cover the whole picture: they bound nothing
+
+    @property
+    def cut(self) -> int:
+        """Views in which the object reaches the image border."""
+        return sum(view.cut for view in self.views)
+
+
+def mask_set(
+    cameras: Sequence[Camera], masks: Sequence[Tensor | None], depths: Sequence[Tensor] | None = None
+) -> MaskSet:
+    """Check and sort the masks of the training views; ``depths`` (H, W) of the base set, for each of them.
+
+    Raises:
+        RtgsError: a mask of another size than its picture; no usable mask, with the reason.
+    """
+    views: list[MaskView] = []
+    without = empty = full = 0
+    for index, (camera, mask) in enumerate(zip(cameras, masks, strict=True)):
+        if mask is None:
+            without += 1
+            continue
+        if mask.shape != (camera.height, camera.width):
+            raise RtgsError(
+                f"mask of view {camera.name!r} is {tuple(mask.shape)} (rows, columns), its camera {camera.height} x "
+                f"{camera.width}: make the mask from this very photo, or import the scene again"
+            )
+        share = float(mask.float().mean())
+        empty += share == 0
+        full += share >= _COVERED
+        if 0 < share < _COVERED:
+            views.append(MaskView(camera, mask.bool(), None if depths is None else depths[index]))
+    if not views:
+        why = "there are no masks"
+        if full:
+            why = f"{full} masks cover the whole picture and {empty} are empty: nothing tells object from scene"
+        elif empty:
+            why = f"all {empty} masks are empty"
+        raise RtgsError(f"no view shows where the transparent object is: {why}")
+    return MaskSet(tuple(views), without, empty, full)
+
+
+@dataclass(frozen=True)
+class SilhouetteScore:
+    """Intersection over union of a mesh's silhouette with the masks."""
+
+    mean: float  # over the views
+    lowest: float
+    lowest_view: str
+    per_view: tuple[float, ...]
+
+    @property
+    def median(self) -> float:
+        """Not moved by a few broken masks."""
+        return float(np.median(self.per_view))
+
+
+def silhouette_score(
+    mesh: TriangleMesh, views: Sequence[MaskView], unknown: Sequence[Tensor] | None = None, stride: int = 1
+) -> SilhouetteScore:
+    """IoU of the silhouette with the masks.
+
+    Args:
+        mesh: world frame.
+        views: cameras and masks.
+        unknown: (H, W) bool for each view, pixels left out: something opaque may hide the object there.
+        stride: every so manieth pixel in both directions only.
+    """
+    guide = MeshGuide(mesh, 0.0)
+    shares = []
+    for index, view in enumerate(views):
+        known = torch.ones_like(view.mask) if unknown is None else ~unknown[index]
+        mask, counted = (
+            picture[stride // 2 :: stride, stride // 2 :: stride].numpy() for picture in (view.mask, known)
+        )
+        seen = silhouette(guide, view.camera, stride)
+        union = np.count_nonzero((seen | mask) & counted)
+        shares.append(np.count_nonzero(seen & mask & counted) / union if union else 1.0)
+    lowest = int(np.argmin(shares))
+    return SilhouetteScore(float(np.mean(shares)), shares[lowest], views[lowest].camera.name, tuple(shares))
+
+
+def silhouette(guide: MeshGuide, camera: Camera, stride: int = 1) -> np.ndarray:
+    """(H', W') bool: pixels whose ray meets the mesh; every ``stride``-th, from the middle of the first block on."""
+    rays = camera.rays(torch.float32)
+    directions = rays.directions[stride // 2 :: stride, stride // 2 :: stride].numpy()
+    origins = np.broadcast_to(rays.origin.numpy(), directions.shape).reshape(-1, 3)
+    return guide.meets(origins, directions.reshape(-1, 3)).reshape(directions.shape[:2])
+
+
+def focus_point(views: Sequence[MaskView]) -> np.ndarray:
+    """(3,) float64: the point nearest to the rays through the masks' middles, in the least-squares sense."""
+    centers = np.stack([view.camera.center.numpy() for view in views])
+    axes = np.stack([_middle_ray(view) for view in views])
+    projectors = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    mean = centers.mean(0)
+    right = np.einsum("nij,nj->i", projectors, centers - mean)
+    return mean + np.linalg.lstsq(projectors.sum(0), right, rcond=1e-9)[0]
+
+
+def _middle_ray(view: MaskView) -> np.ndarray:
+    """(3,) unit ray through the middle of the mask's bounding box."""
+    camera = view.camera
+    rows, columns = (torch.nonzero(view.mask.any(axis))[:, 0].double() + 0.5 for axis in (1, 0))
+    x, y = float((columns.min() + columns.max()) / 2), float((rows.min() + rows.max()) / 2)
+    ray = np.array([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, 1.0]) @ camera.rotation.numpy()
+    return ray / np.linalg.norm(ray)
+
+
+def direction_spread(views: Sequence[MaskView]) -> float:
+    """Degrees: the largest angle under which the object sees two of the cameras."""
+    point = focus_point(views)
+    away = np.stack([view.camera.center.numpy() for view in views]) - point
+    unit = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
+    return float(np.degrees(np.arccos(np.clip((unit @ unit.T).min(), -1, 1))))
