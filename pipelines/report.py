@@ -54,6 +54,7 @@ def report(params: ReportParams, context: StepContext) -> None:
     decisions = [Decision(*item) for item in params.decisions]
     decisions += _masks(inputs)
     decisions += [Decision(**item) for item in summary["decisions"]]  # pyright: ignore[reportGeneralTypeIssues]
+    decisions += _mesh_decisions(inputs)
     decisions += _boundary(training)
     data = ReportData(
         title=params.title,
@@ -124,6 +125,16 @@ def _boundary(training: Path) -> list[Decision]:
     ]
 
 
+def _mesh_decisions(inputs: Mapping[str, Path]) -> list[Decision]:
+    """How the transparent object's mesh was chosen."""
+    from rtgs.report.page import Decision
+
+    if "extract_mesh" not in inputs:
+        return []
+    record = json.loads((inputs["extract_mesh"] / extract_mesh.SUMMARY_FILE).read_text(encoding="utf-8"))
+    return [Decision(what, why) for what, why in record.get("decisions", [])]
+
+
 def _mesh(folder: Path) -> MeshFigure:
     import numpy as np
     from PIL import Image
@@ -132,7 +143,7 @@ def _mesh(folder: Path) -> MeshFigure:
 
     record = json.loads((folder / extract_mesh.SUMMARY_FILE).read_text(encoding="utf-8"))
     pixels = np.asarray(Image.open(folder / extract_mesh.PICTURE_FILE).convert("RGB"))
-    note = f"Voxel {record['voxel']:.4g}, depths up to {record['depth_trunc']:.4g}, seen from {record['picture_from']}."
+    note = f"{record['note']} Seen from {record['picture_from']}."
     return MeshFigure(pixels, record["vertices"], record["faces"], note)
 
 

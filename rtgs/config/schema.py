@@ -9,6 +9,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from rtgs.mesh.settings import ObjectSettings
 from rtgs.mesh.tsdf import TsdfSettings
 from rtgs.prepare.masks_settings import MaskSettings
 from rtgs.prepare.settings import NormalSettings, SfmSettings
@@ -92,6 +93,8 @@ class MeshConfig:
     """Of the transparent object's mesh, for the third stage: ``hull``, ``tsdf``, ``given`` or ``auto``."""
     of: str = "object"
     """What the third stage's TSDF mesh is of: the masked ``object``, or the ``scene`` (register row 15)."""
+    object: ObjectSettings = field(default_factory=ObjectSettings)
+    """How that mesh is found."""
     tsdf: TsdfSettings = field(default_factory=TsdfSettings)
 
 

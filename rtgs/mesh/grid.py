@@ -73,7 +73,7 @@ def bounding_grid(field: Field, center: np.ndarray, radius: float) -> Grid:
 
 
 def _cube(center: np.ndarray, half: float) -> Grid:
-    return Grid(center - half, 2 * half / (_SEARCH - 1), (_SEARCH,) * 3)
+    return Grid(center - half, 2 * half / (_SEARCH - 1), (_SEARCH, _SEARCH, _SEARCH))
 
 
 def _possible_box(field: Field, grid: Grid) -> tuple[np.ndarray, np.ndarray] | None:
@@ -85,7 +85,10 @@ def _possible_box(field: Field, grid: Grid) -> tuple[np.ndarray, np.ndarray] | N
     from scipy.ndimage import label
 
     values = field(grid.points().reshape(-1, 3)).reshape(grid.shape)
-    regions, count = label(values > -0.87 * grid.voxel)  # half the diagonal of a voxel
+    possible = values > -0.87 * grid.voxel
+    regions = np.zeros(grid.shape, np.int32)
+    label(possible, output=regions)  # half the diagonal of a voxel
+    count = int(regions.max())
     if count == 0:
         return None
     sizes = np.bincount(regions.ravel(), weights=(values > 0).ravel(), minlength=count + 1)[1:]

@@ -22,6 +22,7 @@ from rtgs.mesh.smoothing import main_pieces, surface_of_field, taubin
 from rtgs.mesh.triangles import TriangleMesh
 
 AUTOMATIC = -1
+_FEWEST = 3  # masks
 _MOST_OUTVOTED = 4  # masks: more dilates the hull visibly
 _VIEWS_PER_OUTVOTED = 8  # each costs sharpness: one for so many views
 _TRIAL_VOXELS = 48  # of the hulls among which the automatic k chooses
@@ -68,6 +69,8 @@ def carve_hull(masks: MaskSet, settings: HullSettings = HullSettings()) -> HullR
     Raises:
         RtgsError: the masks bound no finite volume, or carve everything away.
     """
+    if len(masks.views) < _FEWEST:
+        raise RtgsError(f"{len(masks.views)} usable masks bound no volume: a hull needs at least {_FEWEST}")
     most = most_outvoted(len(masks.views)) if settings.outvoted == AUTOMATIC else settings.outvoted
     if not 0 <= most < len(masks.views):
         raise RtgsError(f"mesh.hull.outvoted is {settings.outvoted}, there are {len(masks.views)} usable masks")
@@ -185,7 +188,7 @@ def _trimmed(
     seen &= uniform_filter(seen.astype(np.float32), 3, mode="constant") > 0.13  # lone voxels are noise
     if seen.sum() < 0.1 * inside.sum():
         return values, None, "the base set's depth lies in front of nearly all of the hull"
-    near = (values > -2 * grid.voxel) & ~binary_erosion(seen)
+    near = (values > -2 * grid.voxel) & ~np.array(binary_erosion(seen), bool)
     result = values.copy()
     result[near] = np.minimum(values[near], _convex_distance(grid.points()[near], grid.points()[seen], grid.voxel))
     return result, 1 - float((result > 0).sum() / inside.sum()), ""

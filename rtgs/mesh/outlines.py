@@ -67,7 +67,8 @@ def signed_distance(inside: np.ndarray) -> Tensor:
     if inside.all():
         return torch.full(inside.shape, float(max(inside.shape)))
     # Pixel centres are half a pixel from the outline between them and the next pixel.
-    distance = np.where(inside, distance_transform_edt(inside) - 0.5, 0.5 - distance_transform_edt(~inside))
+    within, beyond = (np.asarray(distance_transform_edt(part)) for part in (inside, ~inside))
+    distance = np.where(inside, within - 0.5, 0.5 - beyond)
     return torch.from_numpy(distance.astype(np.float32))
 
 

@@ -81,9 +81,9 @@ class _Samples:
 
     def distances(self, points: np.ndarray) -> np.ndarray:
         """(N,) distances of (N, 3) points to the surface."""
-        from scipy.spatial import cKDTree
+        from scipy.spatial import KDTree
 
-        nearest = cKDTree(self.points).query(points, k=min(4, len(self.points)))[1].reshape(len(points), -1)
+        nearest = KDTree(self.points).query(points, k=min(4, len(self.points)))[1].reshape(len(points), -1)
         return np.min([triangle_distance(points, self.corners[column]) for column in nearest.T], axis=0)
 
 
@@ -130,5 +130,16 @@ def hit_score(mesh: ObjectMesh, truth: TriangleMesh, cameras: list[Camera]) -> H
         cosine = (a.normal * b.normal).sum(0)[a.hit & b.hit]
         angles.append(torch.rad2deg(cosine.clamp(-1, 1).arccos()))
     angle = torch.cat(angles)
-    shares = [float(torch.cat(part).float().mean()) for part in (front, back, second)]
-    return HitScore(*shares, float(angle.mean()), float(angle.median()), shared / max(union, 1))
+    return HitScore(
+        front=_share(front),
+        back=_share(back),
+        second=_share(second),
+        normal_mean=float(angle.mean()),
+        normal_median=float(angle.median()) if len(angle) else float("nan"),
+        iou=shared / max(union, 1),
+    )
+
+
+def _share(found: list[torch.Tensor]) -> float:
+    """Of the pixels of all cameras; NaN where there is none."""
+    return float(torch.cat(found).float().mean())

@@ -150,7 +150,9 @@ def _middle_ray(view: MaskView) -> np.ndarray:
 
 
 def direction_spread(views: Sequence[MaskView]) -> float:
-    """Degrees: the largest angle under which the object sees two of the cameras."""
+    """Degrees: the largest angle under which the object sees two of the cameras; 0 for one camera."""
+    if len(views) < 2:
+        return 0.0
     point = focus_point(views)
     away = np.stack([view.camera.center.numpy() for view in views]) - point
     unit = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)

@@ -90,3 +90,28 @@ def write_mesh_obj(path: Path, mesh: TriangleMesh) -> None:
     with path.open("w", encoding="ascii") as stream:
         np.savetxt(stream, columns, fmt="v" + " %.7g" * columns.shape[1])
         np.savetxt(stream, mesh.faces + 1, fmt="f %d %d %d")
+
+
+def read_mesh_obj(path: Path) -> TriangleMesh:
+    """Vertices and faces of a Wavefront OBJ; polygons become fans, everything else is ignored.
+
+    Raises:
+        RtgsError: no readable OBJ, or no faces.
+    """
+    vertices: list[list[float]] = []
+    faces: list[tuple[int, int, int]] = []
+    try:
+        for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+            words = line.split()
+            if words[:1] == ["v"]:
+                vertices.append([float(word) for word in words[1:4]])
+            elif words[:1] == ["f"]:
+                numbers = [int(word.split("/")[0]) for word in words[1:]]
+                corner = [number - 1 if number > 0 else len(vertices) + number for number in numbers]
+                faces += [(corner[0], corner[k], corner[k + 1]) for k in range(1, len(corner) - 1)]
+        mesh = TriangleMesh(np.array(vertices).reshape(-1, 3), np.array(faces).reshape(-1, 3))
+    except (OSError, ValueError, IndexError) as error:
+        raise RtgsError(f"{path} is not a readable OBJ: {error}") from error
+    if len(mesh.faces) == 0:
+        raise RtgsError(f"{path} holds no faces; is it a point cloud?")
+    return mesh

@@ -6,8 +6,8 @@ marching cubes and removal of small pieces.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any
 
@@ -109,6 +109,31 @@ def fuse_depths(
             f"{settings.min_alpha:g} (inside the masks, where given): nothing to fuse"
         )
     return fusion.extract()
+
+
+def object_fusion(
+    settings: TsdfSettings, resolution: int, pieces: int, cameras: Sequence[Camera], box: np.ndarray | None
+) -> tuple[TsdfSettings, Callable[[DepthView], DepthView]]:
+    """The fusion of one object: settings whose voxel is a share of its ``box`` (2, 3), and what crops a view to it.
+
+    Without a box the lengths are those of the scene. The voxel is no finer than ``finest_pixels`` at the box's middle.
+    """
+    settings = replace(settings, keep_clusters=pieces)
+    if box is None:
+        return settings, lambda view: view
+    side = float((box[1] - box[0]).max())
+    middle = torch.from_numpy(box.mean(0))
+    pixel = float(np.median([abs(float(camera.to_camera(middle)[2])) / camera.fx for camera in cameras]))
+    voxel = settings.voxel or max(side / resolution, settings.finest_pixels * pixel)
+
+    def crop(view: DepthView) -> DepthView:
+        rays = view.camera.rays(torch.float64)
+        points = rays.origin + view.depth[..., None].double() * rays.directions
+        low, high = torch.from_numpy(box)
+        within = ((points >= low) & (points <= high)).all(-1)
+        return replace(view, mask=within if view.mask is None else within & view.mask)
+
+    return replace(settings, voxel=voxel), crop
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,12 @@ from PIL import Image
 
 from pipelines import extract_mesh as step
 from rtgs.cameras import Camera
+from rtgs.config.schema import MeshConfig, RunConfig
 from rtgs.errors import RtgsError
-from rtgs.mesh.triangles import read_mesh_ply
+from rtgs.mesh.container import read_object_mesh
+from rtgs.mesh.hull import HullSettings
+from rtgs.mesh.settings import ObjectSettings
+from rtgs.mesh.triangles import read_mesh_ply, write_mesh_ply
 from rtgs.mesh.tsdf import TsdfSettings
 from rtgs.methods import RenderedView, RenderOptions
 from rtgs.pipeline import StepContext
@@ -22,7 +26,7 @@ from rtgs.render.buffers import RasterBuffers
 from rtgs.scenes.canonical import save_scene
 from rtgs.scenes.scene import Scene, View
 from rtgs.track.null import NullTracker
-from tests.mesh.shapes import camera_at, sphere_depths
+from tests.mesh.shapes import camera_at, sphere, sphere_depths
 
 PARAMS = step.ExtractMeshParams(TsdfSettings(depth_trunc=6.0, voxel=6.0 / 96), obj=True)
 
@@ -94,3 +98,47 @@ def test_masked_mesh_holds_less(context: StepContext) -> None:
     save_scene(sphere_scene(masked=True), context.inputs["import_scene"])
     step.extract_mesh(replace(PARAMS, only_masked=True), context)
     assert len(read_mesh_ply(context.out / "mesh.ply").faces) < whole
+
+
+def whole_masks(scene: Scene) -> Scene:
+    """Every view's mask is the sphere's silhouette."""
+    train = tuple(replace(view, mask=torch.isfinite(sphere_depths(view.camera, 1.0)[0])) for view in scene.train)
+    return replace(scene, train=train)
+
+
+@pytest.mark.parametrize("source", ["auto", "tsdf"])
+def test_mesh_of_the_transparent_object(context: StepContext, source: str) -> None:
+    save_scene(whole_masks(sphere_scene(masked=False)), context.inputs["import_scene"])
+    settings = ObjectSettings(hull=HullSettings(voxels=40), tsdf_resolution=64)
+    step.extract_mesh(replace(PARAMS, tsdf=TsdfSettings(), only_masked=True, source=source, object=settings), context)
+    mesh = read_object_mesh(context.out)
+    record = json.loads((context.out / "mesh.json").read_text())
+    assert mesh.source == {"auto": "hull", "tsdf": "tsdf"}[source]
+    assert record["silhouette_iou"] > 0.93
+    assert record["decisions"][0][0] == f"object mesh: {mesh.source}"
+    assert record["note"].startswith("Of the transparent object")
+    assert record["truth"] == {}  # no such described scene
+    assert np.abs(np.linalg.norm(mesh.mesh.vertices, axis=1) - 1).mean() < 0.06
+    assert (context.out / "mesh.png").is_file()
+    assert (context.out / "mesh.obj").is_file()
+
+
+def test_object_mesh_without_any_mask_is_explained(context: StepContext) -> None:
+    with pytest.raises(RtgsError, match="has no masks"):
+        step.extract_mesh(replace(PARAMS, only_masked=True, source="auto"), context)
+    everything = sphere_scene(masked=True)
+    train = tuple(replace(view, mask=torch.ones_like(view.image[0], dtype=torch.bool)) for view in everything.train)
+    save_scene(replace(everything, train=train), context.inputs["import_scene"])
+    with pytest.raises(RtgsError, match="cover the whole picture"):
+        step.extract_mesh(replace(PARAMS, only_masked=True, source="auto"), context)
+
+
+def test_a_given_mesh_belongs_to_the_plan(tmp_path: Path) -> None:
+    file = tmp_path / "mesh.ply"
+    config = RunConfig(mesh=MeshConfig(source="given", object=ObjectSettings(given=str(file))))
+    with pytest.raises(RtgsError, match="needs mesh.object.given"):
+        step.object_params(config)
+    write_mesh_ply(file, sphere(1.0, 8))
+    first = step.object_params(config).object.given_sha256
+    write_mesh_ply(file, sphere(1.1, 8))
+    assert first != step.object_params(config).object.given_sha256

@@ -1,0 +1,195 @@
+"""Which mesh stands for the transparent object: hull, pane, TSDF or a given file, decided by what the training views
+show."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from rtgs.errors import RtgsError
+from rtgs.mesh.container import ObjectMesh
+from rtgs.mesh.hull import HullResult, carve_hull
+from rtgs.mesh.pane import fit_pane, is_flat
+from rtgs.mesh.settings import FLAT, SOURCES, ObjectSettings
+from rtgs.mesh.silhouettes import MaskSet, SilhouetteScore, direction_spread, silhouette_score
+from rtgs.mesh.triangles import TriangleMesh, read_mesh_obj, read_mesh_ply
+
+Fusion = Callable[[np.ndarray | None], tuple[TriangleMesh, float]]
+"""From the object's box (2, 3), None: not known, to the TSDF mesh and its voxel."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The chosen mesh, and what was decided on the way."""
+
+    mesh: ObjectMesh
+    iou: SilhouetteScore  # with the masks, where nothing opaque hides the object
+    iou_all: SilhouetteScore  # with the masks as they are
+    candidates: dict[str, float]  # mean IoU of every mesh that was made
+    decisions: tuple[tuple[str, str], ...]  # (what, why)
+    hull: HullResult | None
+
+
+class _Candidates:
+    """Makes the meshes one by one, and scores them alike."""
+
+    def __init__(self, masks: MaskSet, settings: ObjectSettings, fuse: Fusion) -> None:
+        self.masks, self.settings, self.fuse = masks, settings, fuse
+        self.decisions: list[tuple[str, str]] = []
+        self.hull: HullResult | None = None
+        self.scores: dict[str, float] = {}
+
+    def score(self, mesh: TriangleMesh) -> SilhouetteScore:
+        """Where an opaque thing may hide the object, pixels are left out; only a hull knows where."""
+        return silhouette_score(mesh, self.masks.views, self.hull.hidden if self.hull else None)
+
+    def carve(self) -> ObjectMesh:
+        """The hull; remembered."""
+        self.hull = hull = carve_hull(self.masks, self.settings.hull)
+        self.scores["hull"] = self.score(hull.mesh).mean
+        if hull.note:
+            self.decisions.append(("hull not trimmed", hull.note))
+        return ObjectMesh(hull.mesh, "hull", hull.voxel, flat=False)
+
+    def pane(self) -> ObjectMesh:
+        """The plane on which the masks agree."""
+        pane = fit_pane(self.masks.views)
+        self.scores["pane"] = self.score(pane.mesh).mean
+        return ObjectMesh(pane.mesh, "hull", pane.voxel, flat=True)
+
+    def fused(self) -> ObjectMesh:
+        """The TSDF mesh inside the hull's box, where there is a hull."""
+        box = None
+        if self.hull is not None:
+            low, high = self.hull.mesh.vertices.min(0), self.hull.mesh.vertices.max(0)
+            margin = 0.05 * (high - low).max()
+            box = np.stack([low - margin, high + margin]).astype(np.float64)
+        mesh, voxel = self.fuse(box)
+        self.scores["tsdf"] = self.score(mesh).mean
+        return ObjectMesh(mesh, "tsdf", voxel, flat=self._flat(mesh))
+
+    def given(self) -> ObjectMesh:
+        """The mesh of the file."""
+        mesh = read_given(self.settings.given)
+        self.scores["given"] = self.score(mesh).mean
+        side = float(np.ptp(mesh.vertices, axis=0).max()) if len(mesh.vertices) else 0.0
+        if len(mesh.faces) == 0 or side == 0:
+            raise RtgsError(f"{self.settings.given} holds no surface: mesh.object.given needs triangles")
+        return ObjectMesh(mesh, "given", side / self.settings.hull.voxels, flat=self._flat(mesh))
+
+    def _flat(self, mesh: TriangleMesh) -> bool:
+        return is_flat(mesh) if self.settings.flat == "auto" else self.settings.flat == "yes"
+
+
+def choose_object_mesh(source: str, masks: MaskSet, settings: ObjectSettings, fuse: Fusion) -> Choice:
+    """The mesh of the transparent object.
+
+    Args:
+        source: ``hull``, ``tsdf``, ``given``, or ``auto``: a pane where one plane explains the masks, else hull or
+            TSDF, whichever silhouette agrees better with the masks of the training views.
+        masks: of the training views, with the base set's depth.
+        settings: what else can be chosen.
+        fuse: makes the TSDF mesh when it is needed.
+
+    Raises:
+        RtgsError: an unknown name, or no mesh can be made; with what was tried.
+    """
+    if source not in SOURCES or settings.flat not in FLAT:
+        raise RtgsError(
+            f"mesh.source is {source!r} (one of {', '.join(SOURCES)}), mesh.object.flat is {settings.flat!r} (one of "
+            f"{', '.join(FLAT)})"
+        )
+    tried = _Candidates(masks, settings, fuse)
+    mesh = {"hull": _hull_or_pane, "auto": _automatic}.get(source, lambda found: getattr(found, _MADE[source])())(tried)
+    about = f"{len(masks.views)} masks, {masks.cut} cut by the image border"
+    left = [f"{masks.without} views have no mask", f"{masks.empty} masks are empty", f"{masks.full} cover everything"]
+    about += "".join(f", {text}" for text, count in zip(left, (masks.without, masks.empty, masks.full)) if count)
+    scores = ", ".join(f"{name} {value:.3f}" for name, value in tried.scores.items())
+    what = f"object mesh: {'a flat pane' if mesh.flat else mesh.source}"
+    tried.decisions.insert(0, (what, f"mesh.source is {source}; silhouette IoU: {scores}; {about}"))
+    score, plain = tried.score(mesh.mesh), silhouette_score(mesh.mesh, masks.views)
+    return Choice(mesh, score, plain, tried.scores, tuple(tried.decisions), tried.hull)
+
+
+_MADE = {"tsdf": "fused", "given": "given"}
+
+
+def _hull_or_pane(tried: _Candidates) -> ObjectMesh:
+    """A pane where the masks are those of a pane, else the hull."""
+    flat, masks, pane = tried.settings.flat, tried.masks, tried.settings.pane
+    if flat == "yes":
+        return tried.pane()
+    spread = direction_spread(masks.views)
+    try:
+        hull = tried.carve()
+    except RtgsError as error:
+        if flat == "no":
+            raise
+        tried.decisions.append(("no hull", str(error)))
+        hull = None
+    if flat == "no" and hull is not None:
+        return hull
+    if len(masks.views) >= pane.min_views and spread >= pane.min_spread:
+        found = tried.pane()
+        needed = max(pane.agree, tried.scores["hull"] - pane.better if hull is not None and not _thin(tried) else 0.0)
+        if tried.scores["pane"] >= needed:
+            return found
+    if hull is None:
+        raise RtgsError(f"neither a hull nor a pane explains the masks: {tried.decisions[-1][1]}")
+    return hull
+
+
+def _thin(tried: _Candidates) -> bool:
+    """The hull cannot tell flat from deep: too few directions."""
+    return direction_spread(tried.masks.views) < tried.settings.hull.min_spread
+
+
+def _automatic(tried: _Candidates) -> ObjectMesh:
+    hull, masks = tried.settings.hull, tried.masks
+    spread = direction_spread(masks.views)
+    trusted = len(masks.views) >= hull.min_views and spread >= hull.min_spread
+    first: ObjectMesh | None = None
+    try:
+        first = _hull_or_pane(tried)
+    except RtgsError as error:
+        tried.decisions.append(("no hull", str(error)))
+    if first is not None and first.flat:
+        return first
+    if not trusted:
+        why = f"{len(masks.views)} masks (mesh.object.hull.min_views {hull.min_views}) from directions {spread:.0f} "
+        tried.decisions.append(("hull not chosen", f"{why}degrees apart at most (min_spread {hull.min_spread:g})"))
+    elif first is not None and tried.scores["hull"] >= tried.settings.accept:
+        return first
+    try:
+        fused = tried.fused()
+    except RtgsError as error:
+        tried.decisions.append(("no TSDF mesh", str(error)))
+        if first is None:
+            reasons = "; ".join(f"{what}: {why}" for what, why in tried.decisions)
+            raise RtgsError(f"no mesh of the transparent object can be made ({reasons})") from error
+        return first
+    better = first is None or not trusted or tried.scores["tsdf"] > tried.scores["hull"]
+    return fused if better or first is None else first
+
+
+def read_given(path: str) -> TriangleMesh:
+    """A triangle mesh from a PLY or OBJ file.
+
+    Raises:
+        RtgsError: no path, no such file, another format, or unreadable.
+    """
+    file = Path(path)
+    if not path or not file.is_file():
+        raise RtgsError(f"mesh.source=given needs mesh.object.given, a PLY or OBJ file; {path!r} is none")
+    readers = {".ply": read_mesh_ply, ".obj": read_mesh_obj}
+    if file.suffix.lower() not in readers:
+        raise RtgsError(f"mesh.object.given is {path}: only .ply and .obj are read")
+    return readers[file.suffix.lower()](file)
+
+
+def names(decisions: Sequence[tuple[str, str]]) -> str:
+    """The decisions on one line."""
+    return "; ".join(f"{what}: {why}" for what, why in decisions)

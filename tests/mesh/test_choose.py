@@ -1,0 +1,140 @@
+"""Which mesh stands for the object: hull, pane, TSDF or a file, and what happens when none can."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from rtgs.errors import RtgsError
+from rtgs.mesh.choose import Choice, choose_object_mesh, read_given
+from rtgs.mesh.hull import HullSettings
+from rtgs.mesh.pane import fit_pane, is_flat
+from rtgs.mesh.settings import ObjectSettings
+from rtgs.mesh.silhouettes import MaskSet, mask_set
+from rtgs.mesh.triangles import TriangleMesh, read_mesh_obj, write_mesh_obj, write_mesh_ply
+from tests.mesh.shapes import box, camera_at, pane, sphere
+from tests.mesh.test_hull import masks_of, ring
+
+SETTINGS = ObjectSettings(hull=HullSettings(voxels=40))
+
+
+def in_front(count: int) -> list:
+    """Cameras before the plane y = 0, up to 35 degrees off its normal."""
+    places = np.linspace(-2.0, 2.0, count)
+    return [
+        replace(camera_at((x, -3.0, 0.6 * np.sin(5 * x)), width=96, height=80, focal=110), name=f"{k:02d}")
+        for k, x in enumerate(places)
+    ]
+
+
+def no_fusion(box: np.ndarray | None) -> tuple[TriangleMesh, float]:
+    raise RtgsError("nothing to fuse here")
+
+
+def chosen(source: str, masks: MaskSet, settings: ObjectSettings = SETTINGS, fuse=no_fusion) -> Choice:
+    return choose_object_mesh(source, masks, settings, fuse)
+
+
+def test_auto_takes_a_good_hull_without_making_another() -> None:
+    choice = chosen("auto", masks_of(sphere(0.8, 24), ring(24)))
+    assert choice.mesh.source == "hull"
+    assert not choice.mesh.flat
+    assert choice.iou.mean > 0.95
+    assert set(choice.candidates) == {"hull", "pane"}
+    assert choice.decisions[0][0] == "object mesh: hull"
+    assert "silhouette IoU: hull 0.9" in choice.decisions[0][1]
+
+
+def test_auto_compares_silhouettes_when_the_hull_is_poor() -> None:
+    body = sphere(0.8, 24)
+    masks = masks_of(body, ring(24))
+    boxes = []
+
+    def fuse(box: np.ndarray | None) -> tuple[TriangleMesh, float]:
+        boxes.append(box)
+        return body, 0.02
+
+    settings = replace(SETTINGS, accept=1.0)
+    choice = chosen("auto", masks, settings, fuse)
+    assert choice.mesh.source == "tsdf"
+    assert choice.candidates["tsdf"] > choice.candidates["hull"]
+    assert (boxes[0][0] < -0.8).all()
+    assert (boxes[0][1] > 0.8).all()
+    without = chosen("auto", masks, settings)
+    assert without.mesh.source == "hull"
+    assert any(what == "no TSDF mesh" for what, _ in without.decisions)
+
+
+def test_few_views_or_directions_make_no_hull() -> None:
+    body = sphere(0.8, 24)
+    few = masks_of(body, ring(8))
+    choice = chosen("auto", few, fuse=lambda box: (body, 0.02))
+    assert choice.mesh.source == "tsdf"
+    assert any(what == "hull not chosen" and "8 masks" in why for what, why in choice.decisions)
+    assert chosen("hull", few).mesh.source == "hull"  # asked for: made
+    one = mask_set(ring(8), [few.views[0].mask, *[None] * 7])
+    choice = chosen("auto", one, fuse=lambda box: (body, 0.02))
+    assert choice.mesh.source == "tsdf"
+    assert "7 views have no mask" in choice.decisions[0][1]
+    with pytest.raises(RtgsError, match="no mesh of the transparent object can be made"):
+        chosen("auto", one)
+    with pytest.raises(RtgsError, match="neither a hull nor a pane"):
+        chosen("hull", one)
+
+
+def test_masks_of_a_pane_give_a_pane() -> None:
+    masks = masks_of(pane(1.4, 1.0), in_front(15))
+    choice = chosen("auto", masks)
+    assert choice.mesh.flat
+    assert choice.decisions[0][0] == "object mesh: a flat pane"
+    assert choice.iou.mean > 0.95
+    vertices = choice.mesh.mesh.vertices
+    assert np.abs(vertices[:, 1]).max() < 0.08  # a pixel is 0.03 wide
+    np.testing.assert_allclose(np.abs(vertices).max(0)[[0, 2]], [0.7, 0.5], atol=0.03)
+    assert (choice.mesh.mesh.face_normals()[:, 1] < 0).all()  # towards the cameras
+    assert not choice.mesh.inside(torch.zeros(3, 3)).any()
+    solid = chosen("hull", masks, replace(SETTINGS, flat="no"))
+    assert not solid.mesh.flat
+
+
+def test_a_pane_can_be_asked_for_and_bodies_are_none() -> None:
+    masks = masks_of(sphere(0.8, 24), ring(16))
+    assert chosen("hull", masks, replace(SETTINGS, flat="yes")).mesh.flat
+    assert fit_pane(masks.views).agreement < 0.85
+    assert is_flat(pane(1.0, 0.7))
+    assert is_flat(box((0, 0, 0), (1, 1, 0.02)))
+    assert not is_flat(box((0, 0, 0), (1, 1, 0.2)))
+
+
+def test_given_meshes(tmp_path: Path) -> None:
+    body = sphere(0.8, 16)
+    masks = masks_of(body, ring(6))
+    write_mesh_ply(tmp_path / "ball.ply", body)
+    write_mesh_obj(tmp_path / "ball.obj", body)
+    for name in ("ball.ply", "ball.obj"):
+        choice = chosen("given", masks, replace(SETTINGS, given=str(tmp_path / name)))
+        assert choice.mesh.source == "given"
+        assert choice.iou.mean > 0.97
+        assert choice.mesh.voxel == pytest.approx(1.6 / 40, rel=0.01)
+    (tmp_path / "quad.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvn 0 0 1\nf 1/1/1 2//1 -2 4\n")
+    assert len(read_mesh_obj(tmp_path / "quad.obj").faces) == 2
+    (tmp_path / "points.obj").write_text("v 0 0 0\n")
+    (tmp_path / "mesh.stl").write_text("solid")
+    for path, message in (
+        ("", "needs mesh.object.given"),
+        (str(tmp_path / "none.ply"), "needs mesh.object.given"),
+        (str(tmp_path / "mesh.stl"), "only .ply and .obj"),
+        (str(tmp_path / "points.obj"), "no faces"),
+    ):
+        with pytest.raises(RtgsError, match=message):
+            read_given(path)
+
+
+def test_misspelt_choices() -> None:
+    masks = masks_of(sphere(0.8, 16), ring(6))
+    with pytest.raises(RtgsError, match="source is 'hul'"):
+        chosen("hul", masks)
+    with pytest.raises(RtgsError, match="flat is 'maybe'"):
+        chosen("hull", masks, replace(SETTINGS, flat="maybe"))
