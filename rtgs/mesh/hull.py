@@ -38,7 +38,7 @@ class HullSettings:
     outvoted: int = AUTOMATIC  # k: masks that may be wrong about a point; -1: what agrees best with most masks
     tie: float = 0.004  # a larger k must raise the median silhouette IoU by more than this
     explained: float = 0.98  # median IoU from which on nothing opaque is thought to hide parts of the object
-    min_seen: float = 0.25  # share of the views that must have a point in the picture for it to belong to the object
+    min_seen: float = 0.4  # share of the views that must have a point in the picture for it to belong to the object
     smoothing: int = 10  # iterations of Taubin's filter
     trim: bool = True  # cut off what the base set's depth shows to lie behind other surfaces (the unseen bottom)
     trim_views: int = 8  # views in front of whose depth a point must lie to stay

@@ -20,7 +20,9 @@ from rtgs.mesh.guide import MeshGuide
 from rtgs.mesh.silhouettes import MaskView
 from rtgs.mesh.triangles import TriangleMesh
 
+HIDDEN = 1e9  # instead of a distance: the view says nothing about the point
 _CHUNK = 1 << 16  # points
+_FEWEST = 3  # views that must speak of a point
 _BEHIND = 0.003  # of the depth: how far before the opaque surface a point counts as hidden by it
 
 
@@ -35,22 +37,23 @@ class Outline:
     bare: Tensor | None  # the same of the mask alone; None: no pixel is hidden
 
     def distance(self, points: Tensor) -> Tensor:
-        """(N,) signed distances of (N, 3) points in world units; inf: the view says nothing about the point."""
+        """(N,) signed distances of (N, 3) points in world units; inf: not in the picture, ``HIDDEN``: not seen."""
         camera = self.view.camera
         pixels, depth = camera.project(points)
         size = torch.tensor([camera.width, camera.height], dtype=points.dtype)
         framed = (depth > 0) & (pixels >= 0).all(1) & (pixels <= size).all(1)
         places = torch.where(framed[:, None], 2 * pixels / size - 1, 0.0).float()[None, None]
         found = _sampled(self.whole, places)
+        silent = torch.zeros(len(points), dtype=torch.bool)
         if self.bare is not None and self.surface is not None:
             column, row = (pixels[:, k].nan_to_num().clamp(0, size[k].item() - 1).long() for k in (0, 1))
             index = row * camera.width + column
             hidden = self.hidden.reshape(-1)[index]
             free = hidden & (depth <= (1 - _BEHIND) * self.surface.reshape(-1)[index])
             found = torch.where(free, _sampled(self.bare, places), found)
-            found = torch.where(hidden & ~free & (found > 0), torch.inf, found)
+            silent = hidden & ~free & (found > 0)
         scale = depth.float() / (camera.fx * camera.fy) ** 0.5  # world units of a pixel
-        return torch.where(framed, found * scale, torch.inf)
+        return torch.where(framed, torch.where(silent, HIDDEN, found * scale), torch.inf)
 
 
 def _sampled(picture: Tensor, places: Tensor) -> Tensor:
@@ -144,8 +147,8 @@ class MaskField:
     def outvoting(self, points: np.ndarray, counts: Sequence[int]) -> np.ndarray:
         """(len(counts), N): for every k of ``counts`` the (k+1)-th smallest distance over the views of (N, 3) points.
 
-        Views that say nothing about a point do not count, and k shrinks with the share of those that do; a point of
-        which too few speak is outside.
+        Views that say nothing about a point do not count, and k shrinks with the share of those that do; a point that
+        too few have in the picture is outside.
         """
         chunks = np.array_split(points, max(1, -(-len(points) // _CHUNK)))
         return np.concatenate([self._outvoting(torch.from_numpy(chunk), counts) for chunk in chunks], axis=1)
@@ -153,10 +156,11 @@ class MaskField:
     def _outvoting(self, points: Tensor, counts: Sequence[int]) -> np.ndarray:
         values = torch.stack([outline.distance(points) for outline in self.outlines])
         smallest = values.topk(max(counts) + 1, dim=0, largest=False, sorted=True).values
-        seen = torch.isfinite(values).sum(0)
-        ranks = [(k * seen) // len(values) for k in counts]
+        seen, heard = torch.isfinite(values).sum(0), (values < HIDDEN).sum(0)
+        ranks = [(k * heard) // len(values) for k in counts]
         result = torch.cat([smallest.gather(0, rank[None]) for rank in ranks])
-        return torch.where((seen < self.min_seen) | (result == torch.inf), -torch.inf, result).numpy()
+        outside = (seen < self.min_seen) | (heard < _FEWEST) | (result >= HIDDEN)
+        return torch.where(outside, -torch.inf, result).numpy()
 
     def distance(self, k: int) -> Callable[[np.ndarray], np.ndarray]:
         """The field for one k: (N, 3) points to (N,) distances."""

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from rtgs.errors import RtgsError
-from rtgs.mesh.outlines import Outline, plain_outlines
+from rtgs.mesh.outlines import HIDDEN, Outline, plain_outlines
 from rtgs.mesh.silhouettes import MaskView, focus_point
 from rtgs.mesh.triangles import TriangleMesh
 
@@ -121,7 +121,7 @@ def _votes(outlines: Sequence[Outline], points: np.ndarray) -> tuple[Tensor, Ten
         camera = outline.view.camera
         distance = outline.distance(flat)
         pixel = camera.to_camera(flat)[:, 2].float() / (camera.fx * camera.fy) ** 0.5
-        known = torch.isfinite(distance)
+        known = distance < HIDDEN
         seen += known
         inside += torch.where(known, (distance / pixel.clamp_min(1e-9) + 0.5).clamp(0, 1), 0.0)
     return inside / seen.clamp_min(1), seen

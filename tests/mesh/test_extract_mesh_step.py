@@ -109,7 +109,7 @@ def whole_masks(scene: Scene) -> Scene:
 @pytest.mark.parametrize("source", ["auto", "tsdf"])
 def test_mesh_of_the_transparent_object(context: StepContext, source: str) -> None:
     save_scene(whole_masks(sphere_scene(masked=False)), context.inputs["import_scene"])
-    settings = ObjectSettings(hull=HullSettings(voxels=40), tsdf_resolution=64)
+    settings = ObjectSettings(hull=HullSettings(voxels=40, outvoted=0), tsdf_resolution=64)
     step.extract_mesh(replace(PARAMS, tsdf=TsdfSettings(), only_masked=True, source=source, object=settings), context)
     mesh = read_object_mesh(context.out)
     record = json.loads((context.out / "mesh.json").read_text())
@@ -118,7 +118,7 @@ def test_mesh_of_the_transparent_object(context: StepContext, source: str) -> No
     assert record["decisions"][0][0] == f"object mesh: {mesh.source}"
     assert record["note"].startswith("Of the transparent object")
     assert record["truth"] == {}  # no such described scene
-    assert np.abs(np.linalg.norm(mesh.mesh.vertices, axis=1) - 1).mean() < 0.06
+    assert np.abs(np.linalg.norm(mesh.mesh.vertices, axis=1) - 1).mean() < 0.12  # twelve views
     assert (context.out / "mesh.png").is_file()
     assert (context.out / "mesh.obj").is_file()
 
@@ -136,7 +136,7 @@ def test_object_mesh_without_any_mask_is_explained(context: StepContext) -> None
 def test_a_given_mesh_belongs_to_the_plan(tmp_path: Path) -> None:
     file = tmp_path / "mesh.ply"
     config = RunConfig(mesh=MeshConfig(source="given", object=ObjectSettings(given=str(file))))
-    with pytest.raises(RtgsError, match="needs mesh.object.given"):
+    with pytest.raises(RtgsError, match="given needs mesh"):
         step.object_params(config)
     write_mesh_ply(file, sphere(1.0, 8))
     first = step.object_params(config).object.given_sha256

@@ -138,7 +138,7 @@ def test_two_objects_stay_two() -> None:
 
 
 def test_objects_cut_by_every_image_border() -> None:
-    """Only the middle of a tall column is ever in the picture: the hull is what at least a quarter of the views see."""
+    """Only the middle of a tall column is ever in the picture: the hull is what two fifths of the views see."""
     column = cylinder(0.4, 3.0)
     masks = masks_of(column, ring(36))
     assert masks.cut == 36
