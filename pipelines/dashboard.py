@@ -13,6 +13,7 @@ from rtgs.pipeline.executors import STEPS_EXPERIMENT
 from rtgs.track.mlflow import PARENT_TAG, MlflowTracking
 
 _PAGE = 1000  # runs counted per experiment
+SWEEP_TAG = "rtgs.sweep"  # of the parent run (pipelines.sweep)
 GUIDE = """In an experiment: the table of runs (columns eval/psnr, eval/ssim; group by rtgs.method); tick some and
 Compare for curves side by side. In a run: Model metrics has the curves (train/psnr, train/loss), Artifacts > images
 the sliders (<view>/<layer>, one stop per step), tables/eval.json every test view, report.html the page,
@@ -52,8 +53,8 @@ def overview(tracking: MlflowTracking, address: str) -> list[str]:
         if experiment.name == STEPS_EXPERIMENT:
             lines.append(f"  {experiment.name}: {len(runs)} executed steps  {page}")
             continue
-        sweeps = {run.data.tags.get(PARENT_TAG) for run in runs} - {None}
-        variants = [run for run in runs if run.info.run_id not in sweeps]
+        variants = [run for run in runs if SWEEP_TAG not in run.data.tags]
+        sweeps = {run.data.tags.get(PARENT_TAG) for run in variants} - {None}
         text = f"  {experiment.name}: {len(variants)} runs" + (f" in {len(sweeps)} sweeps" if sweeps else "")
         measured = [run for run in variants if "eval/psnr" in run.data.metrics]
         if measured:
