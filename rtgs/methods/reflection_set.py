@@ -67,15 +67,26 @@ class ReflectionSet(SurfelSet):
         self.tree.clear()
 
 
-def reflection_surfels(settings: ReflectionSettings, points: Tensor, generator: torch.Generator) -> Surfels:
-    """The initial reflection set: stratified random surfels of random colour in its box (methods.md 6.1).
+def reflection_box(settings: ReflectionSettings, points: Tensor, extent: float) -> Tensor:
+    """(2, 3) corners, world, of the box where the reflection set starts: what mirror rays may meet.
 
-    The box is that of the points (P, 3), 0.5 to 99.5 percentile per axis, or a cube around the origin
-    (``box_half`` > 0). Each of ``cells``^3 cells gets ``per_cell`` points.
+    That of the points (P, 3), 0.5 to 99.5 percentile per axis, but from its middle at least ``box_reach`` x ``extent``
+    along every axis; or a cube around the origin (``box_half`` > 0). Points alone are not enough: cameras look down at
+    an object, and the sky or ceiling that it mirrors has no points.
     """
     if settings.box_half > 0:
-        box = settings.box_half * torch.tensor([[-1.0, -1, -1], [1, 1, 1]])
-    else:
-        usable = torch.isfinite(points).all(dim=1)
-        box = points_box(points[usable])
+        return settings.box_half * torch.tensor([[-1.0, -1, -1], [1, 1, 1]])
+    box = points_box(points[torch.isfinite(points).all(dim=1)])
+    middle, reach = box.mean(dim=0), settings.box_reach * extent
+    return torch.stack((torch.minimum(box[0], middle - reach), torch.maximum(box[1], middle + reach)))
+
+
+def reflection_surfels(
+    settings: ReflectionSettings, points: Tensor, extent: float, generator: torch.Generator
+) -> Surfels:
+    """The initial reflection set: stratified random surfels of random colour in its box (methods.md 6.1).
+
+    Each of the ``cells``^3 cells of :func:`reflection_box` gets ``per_cell`` points.
+    """
+    box = reflection_box(settings, points, extent)
     return stratified_surfels(box, settings.cells, settings.per_cell, settings.init, generator)

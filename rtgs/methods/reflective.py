@@ -10,7 +10,12 @@ from torch import Tensor
 
 from rtgs.cameras import Camera
 from rtgs.evaluate.weights import MissingWeights
-from rtgs.gaussians.materials import MaterialSurfels, activate_materials, with_materials, without_materials
+from rtgs.gaussians.materials import (
+    MaterialSurfels,
+    activate_materials,
+    with_materials,
+    without_materials,
+)
 from rtgs.gaussians.surfels import Surfels
 from rtgs.methods.base import (
     Decision,
@@ -93,7 +98,8 @@ class ReflectiveMethod(SurfelMethod):
 
     def _add_reflection(self) -> tuple[StepEvent, ...]:
         self.base.adopt(with_materials(self.base.surfels, self.settings.materials))  # type: ignore[arg-type]
-        self.reflection = self._new_set(reflection_surfels(self.settings.reflection, self._points, self.generator))
+        surfels = reflection_surfels(self.settings.reflection, self._points, self.extent, self.generator)
+        self.reflection = self._new_set(surfels)
         return (StepEvent("begin", "reflection", f"{len(self.reflection)} surfels in the box"),)
 
     def _find_perceptual(self) -> PerceptualLoss | None:
@@ -177,6 +183,13 @@ class ReflectiveMethod(SurfelMethod):
         assert traced.colors is not None
         color = traced.colors.T
         weights = pixel_weights(mirrored.cosine, pixels, self.settings.optics)
+        gain = self.settings.transmittance.max_gain
+        if glass is not None and gain is not None:
+            bounded = replace(self.settings.optics, max_gain=gain)
+            reflection = pixel_weights(mirrored.cosine, pixels, bounded).reflection
+            weights = replace(
+                weights, reflection=torch.where(glass.inside[chosen.index], reflection, weights.reflection)
+            )
         light, passed = weights.reflection * color, None
         if glass is not None:
             passed = self.transmit(glass, glass_rays(glass, chosen.index, rays.origin, view), step, options)

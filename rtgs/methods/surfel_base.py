@@ -190,7 +190,8 @@ class SurfelMethod:
         if _on(self.starts.normal, step):
             add("normal", self._normal_consistency(buffers, rendered.camera), weights.normal)
         if _on(self.starts.mono_normal, step) and view.normal is not None:
-            add("mono_normal", self._mono_normal(buffers, view.normal, rendered.camera), weights.mono_normal)
+            weight = weights.mono_normal * weights.mono_normal_gain
+            add("mono_normal", self._mono_normal(buffers, view.normal, rendered.camera), weight)
         if _on(self.starts.distortion, step):
             assert buffers.distortion is not None
             add("distortion", distortion_loss(buffers.distortion), weights.distortion)

@@ -17,7 +17,9 @@ class OpticsSettings:
     weight: str = (
         "microfacet"  # or "literal" (paper's blend without the cosine), "split_sum" (its ablation), "envgs" (1)
     )
-    max_gain: float = 16.0  # S_max: bound of the microfacet gain; 1 conserves energy, 0 = no bound (the paper)
+    # S_max, bound of the microfacet gain: 1 conserves energy and is nearly the same from all angles, 0 = no bound (the
+    # paper), 16 = methods.md 4.4; chosen in docs/reflection.md.
+    max_gain: float = 1.0
     remap: str = "pbrt"  # width g(alpha) of the paper, once squared in D and G; "none": g = alpha
     roughness_floor: float = 1e-3  # argument of g (PBRT): below 1.55e-4 the remap turns round
     masking: str = "correlated"  # height-correlated Smith; "separable": product of two G1

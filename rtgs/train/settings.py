@@ -58,6 +58,7 @@ class LossSettings:
     normal_start: float = 7 / 30  # 2DGS: from 7,000 of 30,000; EnvGS: from 0
     normal_inverse_depth: bool = False  # EnvGS: weight by 1 - (d - p1)/(p99 - p1), clipped, detached
     mono_normal: float = 0.0  # RT-GS 0.01; only where the scene has normals
+    mono_normal_gain: float = 1.0  # its weight is multiplied by it: short presets (docs/reflection.md), 1 = published
     mono_normal_start: float = 0.0  # EnvGS: from 0
     mono_normal_form: str = "cosine"  # "cosine" (paper: 1 - n.N) or "envgs" (|difference|_1 + 1 - cos)
     distortion: float = 0.0  # 2DGS: 0 unbounded, 1000 bounded
@@ -209,6 +210,9 @@ class ReflectionSettings:
     specular_reset: bool = True  # register row 25: at resets of the base set k_s becomes min(k_s, initial)
     cells: int = 32  # per axis of the box: stratified random points (16 at 256x192: kernels.md)
     per_cell: int = 5
+    # The points' box reaches at least so far from its middle on every axis, times the extent; 0 = as it is.
+    # EnvGS's boxes reach 3.8 (spheres), 2.7 (toycar), 4.2 and 1.9 (sedan) extents.
+    box_reach: float = 2.0
     box_half: float = 0.0  # half side of a cube around the origin; 0 = box of the points (EnvGS: 20 for two scenes)
     offset: float = 1e-4  # of the mirror ray's start, times the extent (methods.md 6.3; EnvGS 0)
     smallest_alpha: float = 1e-2  # pixels with less coverage have no surface to reflect at
@@ -275,6 +279,7 @@ class TransmittanceSettings:
     compositing: str = "over"  # row 12: C_1 + (1 - A_1) C_2; "sum": C_1 + C_2
     first_surface: str = "mesh"  # where the object's pixels have their surface; the paper: "base", the rasterised depth
     normal: str = "base"  # the rasterised normals there (of the interface, if there is one); "mesh": fixed, for tests
+    max_gain: float | None = None  # S_max in the object's pixels; None: optics.max_gain
     split: bool = True  # base surfels inside the mesh become the transmittance set; the paper: a random set (False)
     split_margin: float = 1.0  # voxels outside the mesh that still count as inside
     box: str = "object"  # row 16, of a random set; "scene": the paper

@@ -15,8 +15,11 @@ class MaterialSettings:
     """What each surfel of the base set says about its surface (methods.md 2, 3.3, 4.2, 4.4)."""
 
     specular: float = 1e-3  # initial k_s: EnvGS 1e-3 (register row 28: for all scenes); 0.1 for gardenspheres
-    roughness: float = 0.005  # initial: with f0 0.04 the weight w_r starts at 0.2 (methods.md 4.4)
-    f0: float = 0.04  # initial reflectance at normal incidence: a dielectric; 0.5 for mirrors
+    # Initial roughness and reflectance at normal incidence, register row 6. With S_max 1 the weight w_r starts at 0.85
+    # and stays there to grazing, close to EnvGS's 1. With methods.md 4.4's 0.005 and 0.04 it starts at 0.2: a mirror
+    # ray is darker than what it replaces, and k_s falls before the reflection set has learned (docs/reflection.md).
+    roughness: float = 0.002
+    f0: float = 0.9
     f0_channels: int = 1  # register row 6: the paper writes a scalar; 3 = rgb
     roughness_curve: str = "log"  # roughness = floor^(1 - sigmoid(raw)); "linear": floor + (1 - floor) sigmoid(raw)
     roughness_floor: float = 1e-3  # methods.md 4.2: without it the remap turns round
@@ -109,7 +112,7 @@ class InterfaceSettings:
     floor: float = 0.9  # opacities stay at or above it: photometric training erodes glass; no resets here
     scale: float = 1.0  # times the distance to the neighbours
     specular: float = 0.9  # initial k_s: L_spec's target
-    # With both, w_r starts near 0.8 (base set: 0.2, methods.md 4.4): bright reflections form within a short run.
+    # With both and transmittance.max_gain 16, w_r starts near 0.8: bright reflections form within a short run.
     f0: float = 0.15  # initial; against 0.04: docs/transmittance.md
     roughness: float = 0.005  # initial
     normal_loss: float = 0.2  # weight of 1 - n . N of the mesh in the masks: 0.01 does nothing there, 0.05 harms

@@ -154,12 +154,15 @@ def test_every_loss_that_is_on_is_computed_and_weighted():
 @pytest.mark.parametrize("form", ["cosine", "envgs"])
 def test_geometric_terms_are_those_of_the_settings(inverse: bool, form: str):
     loss = LossSettings(
-        normal_start=0, normal_inverse_depth=inverse, mono_normal=0.01, mono_normal_form=form, distortion=0.0
-    )
+        normal_start=0, normal_inverse_depth=inverse, mono_normal=0.01, mono_normal_gain=10.0,
+        mono_normal_form=form, distortion=0.0,
+    )  # fmt: skip
     method, scene = make(replace(small_method(), loss=loss), normals=True)
     view = scene.train[0]
     rendered = method.render(view.camera, 0)
-    values = {term.name: term.value for term in method.losses(rendered, view, 0).terms}
+    terms = method.losses(rendered, view, 0).terms
+    values = {term.name: term.value for term in terms}
+    assert {term.name: term.weight for term in terms}["mono_normal"] == pytest.approx(0.1)
     maps = rendered.buffers
     depth, normal = maps.depth, maps.normal
     assert depth is not None

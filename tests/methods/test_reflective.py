@@ -15,11 +15,14 @@ import torch
 from reflective_cases import SAMPLED, new_method, recipe, schedule, tiny, train_all
 from safetensors.torch import load_file
 
+from rtgs.config import compose
 from rtgs.gaussians.materials import MATERIAL_NAMES, MaterialSurfels
 from rtgs.methods import RenderOptions, Stage
+from rtgs.methods.reflection_set import reflection_box, reflection_surfels
 from rtgs.methods.reflective import ReflectiveMethod
+from rtgs.optics.microfacet import specular_weights
 from rtgs.train.checkpoint import checkpoint_path
-from rtgs.train.settings import MethodSettings
+from rtgs.train.settings import MethodSettings, ReflectionSettings
 from rtgs.train.specular_settings import MatteSettings, PropagationSettings, TracedShareSettings
 from rtgs.train.trainer import Trainer
 
@@ -69,6 +72,30 @@ def test_the_first_stage_is_that_of_the_plain_method_and_the_second_adds_what_it
 def test_a_share_of_one_leaves_the_stage_out_and_of_zero_the_first(start: float, stages: list[str]):
     method = new_method(recipe(start=start), tiny(), schedule())
     assert [stage.name for stage in method.stages] == stages
+
+
+def test_the_reflection_set_surrounds_what_the_cameras_look_at():
+    """Points end at the top of a ball that mirrors the sky: the box must not."""
+    flat = torch.tensor([[-4.0, -4, 0], [4.0, 4, 1], [float("nan"), 0, 9]])
+    own, reaching = (reflection_box(ReflectionSettings(box_reach=reach), flat, 3.0) for reach in (0.0, 1.0))
+    torch.testing.assert_close(own, torch.tensor([[-3.96, -3.96, 0.005], [3.96, 3.96, 0.995]]))
+    torch.testing.assert_close(reaching, torch.tensor([[-3.96, -3.96, -2.5], [3.96, 3.96, 3.5]]))
+    cube = reflection_box(ReflectionSettings(box_half=20.0), flat, 3.0)
+    assert cube.tolist() == [[-20.0] * 3, [20.0] * 3]
+    settings = ReflectionSettings(cells=3, per_cell=2)
+    means = reflection_surfels(settings, flat, 3.0, torch.Generator().manual_seed(0)).means.detach()
+    assert len(means) == 54
+    assert float(means[:, 2].max()) > 3
+
+
+def test_rtgs_starts_as_bright_as_the_mirror_ray_from_every_angle():
+    """w_r near EnvGS's 1: a start that is darker than what it replaces teaches k_s to fall."""
+    config, _ = compose(["scene=demo", "method=rtgs", "preset=quick"])
+    materials, optics = config.method.materials, config.method.optics
+    cosine = torch.linspace(0.2, 1, 9)
+    start = torch.full_like(cosine, materials.roughness), torch.full_like(cosine, materials.f0)
+    weight = specular_weights(cosine, *start, optics).reflection
+    assert 0.8 < float(weight.min()) <= float(weight.max()) <= 1
 
 
 @pytest.mark.parametrize("name", ["rtgs", "envgs"])

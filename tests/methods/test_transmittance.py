@@ -69,6 +69,24 @@ def test_the_base_set_is_split_by_the_mesh(made: GlassScene):
     assert float(method.interface.surfels.opacity_logits.detach().sigmoid().min()) == pytest.approx(0.95)
 
 
+def test_glass_may_have_a_bound_of_its_own(made: GlassScene):
+    """``transmittance.max_gain`` changes the reflection in the object's pixels and nowhere else."""
+    recipe = glass_recipe()
+    method = begun(recipe, made)
+    view = made.scene.test[0] if made.scene.test else made.scene.train[0]
+    images = []
+    with torch.no_grad():
+        for gain in (None, recipe.optics.max_gain, 16.0):
+            method.settings = replace(recipe, transmittance=replace(recipe.transmittance, max_gain=gain))
+            images.append(method.render(view.camera, 31, LAYERS))
+    assert torch.equal(images[0].image, images[1].image)
+    inside = images[0].transparent
+    assert inside is not None
+    changed = (images[0].image != images[2].image).any(0)
+    assert not bool(changed[~inside].any())
+    assert bool(changed[inside].any())
+
+
 def test_quaternions_turn_the_third_axis_to_the_normal():
     normals = torch.nn.functional.normalize(torch.randn(50, 3, generator=torch.Generator().manual_seed(0)), dim=1)
     normals = torch.cat((normals, torch.tensor([[0, 0, 1.0], [0, 0, -1.0]])))
