@@ -34,17 +34,24 @@ MIRROR_BALL = "mirror_ball"  # of the tests, instead of an embedded scene
 _M, _O = "method.materials", "method.optics"
 _DIELECTRIC = ("method=rtgs", f"{_M}.f0=0.04", f"{_M}.roughness=0.005", f"{_O}.max_gain=16")
 _POINTS = "method.reflection.box_reach=0"
+_COSINE = "method.loss.mono_normal_form=cosine"
 _WEAK = "method.loss.mono_normal_gain=1"
 CHOICES: dict[str, tuple[str, ...]] = {  # the methods' own configs first
     "2dgs": ("method=2dgs",),
     "envgs": ("method=envgs",),
     "rtgs": ("method=rtgs",),
-    "all as before": (*_DIELECTRIC, _POINTS, _WEAK),  # memo's start, box of the points, published weight of L_mono
+    "all as before": (
+        *_DIELECTRIC,
+        _POINTS,
+        _WEAK,
+        _COSINE,
+    ),  # memo's start, box of the points, published weight of L_mono
     "dielectric start": _DIELECTRIC,
     "half mirror, S_max 16": ("method=rtgs", f"{_M}.f0=0.5", f"{_M}.roughness=0.02", f"{_O}.max_gain=16"),
     "k_s from 0.3": ("method=rtgs", f"{_M}.specular=0.3"),
-    "L_mono as published": ("method=rtgs", _WEAK),
-    "L_mono x 50": ("method=rtgs", "method.loss.mono_normal_gain=50"),
+    "L_mono as a cosine": ("method=rtgs", _COSINE),
+    "L_mono as published": ("method=rtgs", _WEAK, _COSINE),
+    "L_mono x 50": ("method=rtgs", _COSINE, "method.loss.mono_normal_gain=50"),
     "box of the points": ("method=rtgs", _POINTS),
 }
 
