@@ -139,6 +139,17 @@ class MeshGuide:
         answer = self._scene.run(origins.astype(np.float32), directions.astype(np.float32), output=True)
         return answer["primID"] >= 0
 
+    def nearest(self, camera: Camera) -> Tensor:
+        """(H, W) float32 z-depth of the first crossing on every pixel ray, 0 where there is none; one cast."""
+        rays = camera.rays(torch.float64)
+        directions = rays.directions.reshape(-1, 3).numpy()
+        lengths = np.linalg.norm(directions, axis=1)
+        unit = (directions / lengths[:, None]).astype(np.float32)
+        origins = np.broadcast_to(rays.origin.numpy().astype(np.float32), unit.shape).copy()
+        answer = self._scene.run(origins, unit, output=True)
+        depth = np.where(answer["primID"] >= 0, answer["tfar"] / lengths, 0.0).astype(np.float32)
+        return torch.from_numpy(depth).reshape(camera.height, camera.width)
+
     def _first_hits(
         self,
         origins: np.ndarray,
