@@ -87,7 +87,7 @@ class Ours:
 
     def forward(self) -> None:
         self.native = None  # its memory goes back to the pool first, as between two training steps
-        native = self.native = core.Tracing(CUTOFF, ALPHA_CUTOFF, 3, False, self.order, self.threads)
+        native = self.native = core.Tracing(CUTOFF, ALPHA_CUTOFF, 3, False, False, self.order, self.threads)
         bounds = (None, None, T_MIN, float("inf"))
         inputs = (*self.case.geometry(), *self.appearance, *self.rays)
         native.forward(self.tree, *inputs, *bounds, True, *self.outputs, self.weight_sum)

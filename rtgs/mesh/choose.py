@@ -169,7 +169,10 @@ def _automatic(tried: _Candidates) -> ObjectMesh:
         tried.decisions.append(("no TSDF mesh", str(error)))
         if first is None:
             reasons = "; ".join(f"{what}: {why}" for what, why in tried.decisions)
-            raise RtgsError(f"no mesh of the transparent object can be made ({reasons})") from error
+            raise RtgsError(
+                f"no mesh of the transparent object can be made ({reasons}): mask it in more photos, give its mesh "
+                "(mesh.source=given), or train without the third stage (ablation=two_stages)"
+            ) from error
         return first
     better = first is None or not trusted or tried.scores["tsdf"] > tried.scores["hull"]
     return fused if better or first is None else first
