@@ -42,7 +42,8 @@ def plan(capsys, *words: str) -> list[list[str]]:
 
 def test_photos_become_a_table(photos, tmp_path, capsys):
     words = [f"scene={photos}", *QUICK, "ablation=two_stages"]  # one mask bounds no object
-    assert [row[0] for row in plan(capsys, *words)[1:5]] == ["masks", "normals", "sfm", "import_scene"]
+    rows = [row[0] for row in plan(capsys, *words)[1:6]]
+    assert rows == ["masks", "normals", "train_transmittance", "sfm", "import_scene"]
     assert main(["run", *words]) == 0
     shown = capsys.readouterr().out
     assert "PSNR" in shown
