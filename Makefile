@@ -45,7 +45,7 @@ $(READY): $(NATIVE)
 	$(BIN)/pip install -q -e '.[dev,prepare,synthetic]'
 	@touch $(READY)
 
-demo: setup ## train the embedded glass scene, end with a page of pictures and numbers (under 5 minutes)
+demo: setup ## train the embedded glass scene, end with a page of pictures and numbers (about 5 minutes)
 	$(BIN)/rtgs run scene=demo method=rtgs preset=quick $(RUN)
 
 reproduce-table1: setup ## mirrors: every method on every scene, ends with tables/table1-PRESET (PRESET= SEEDS= DATA= WORKERS=)

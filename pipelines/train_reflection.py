@@ -14,7 +14,7 @@ def train_reflection(params: StageParams, context: StepContext) -> None:
 
 STEP = StepKind(
     "train_reflection",
-    2,
+    3,
     train_reflection,
     helpers=(
         *train_diffuse.STEP.helpers,

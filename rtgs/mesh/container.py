@@ -301,7 +301,8 @@ def _spread(found: _Cached, camera: Camera) -> ObjectSurfaces:
     near, far, normal = torch.zeros(size), torch.zeros(size), torch.zeros(3, size)
     hit[index], second[index] = True, found.second
     near[index], far[index] = found.near, found.far
-    normal[:, index] = torch.nn.functional.normalize(found.normal.float(), dim=0)
+    facing = found.normal.float()
+    normal[:, index] = facing * facing.square().sum(0).clamp_min(1e-12).rsqrt()
     return ObjectSurfaces(
         hit.view(shape), near.view(shape), far.view(shape), second.view(shape), normal.view(3, *shape)
     )

@@ -62,11 +62,12 @@ def mirror_rays(pixels: SurfacePixels, center: Tensor, view: Tensor, length: str
 
     ``length`` of the mirror rays: "unit", or "raw": as long as the ray they come from (register row 23).
     """
-    outward = -view / view.norm(dim=0)  # omega_o
+    length_of_view = view.square().sum(0).sqrt()  # over three rows, many times faster than norm(dim=0)
+    outward = -view / length_of_view  # omega_o
     normal = pixels.normal * pixels.normal.square().sum(0).clamp_min(SHORTEST_NORMAL**2).rsqrt()
     cosine = (normal * outward).sum(0)
     directions = 2 * cosine * normal - outward
-    directions = directions * view.norm(dim=0) if length == "raw" else directions
+    directions = directions * length_of_view if length == "raw" else directions
     origins = center[:, None] + pixels.depth * view
     return MirrorRays(origins.T.contiguous(), directions.T.contiguous(), cosine)
 

@@ -232,8 +232,8 @@ class ReflectiveMethod(SurfelMethod):
         surface &= flat.normal.square().sum(0) > SHORTEST_NORMAL**2
         showing = None
         if settings.traced.threshold > 0:
-            unit = flat.normal / flat.normal.norm(dim=0).clamp_min(SHORTEST_NORMAL)
-            cosine = -(unit * view).sum(0) / view.norm(dim=0)
+            unit = flat.normal / flat.normal.square().sum(0).sqrt().clamp_min(SHORTEST_NORMAL)
+            cosine = -(unit * view).sum(0) / view.square().sum(0).sqrt()
             weight = pixel_weights(cosine, flat, self.settings.optics).reflection
             weight = weight if weight.ndim == 1 else weight.amax(0)
             showing = flat.specular * weight.clamp_min(1)
