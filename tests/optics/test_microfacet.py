@@ -86,7 +86,7 @@ def test_the_closed_form_is_the_generic_brdf_at_the_mirror_direction(masking: st
 def test_separable_masking_is_lower_by_what_the_register_says(width: float, lower: float):
     at = f64(0.5), f64(width)
     ratio = smith_masking(at[0], at[0], at[1], "separable") / smith_masking(at[0], at[0], at[1])
-    assert 1 - float(ratio) == pytest.approx(lower, abs=0.012)
+    assert 1 - float(ratio) == pytest.approx(lower, abs=0.006)  # the register rounds to two digits
 
 
 def test_schlick_at_its_ends():
