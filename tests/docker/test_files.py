@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 import yaml
 
+from rtgs.pipeline.engine import worker_environment
+
 DOCKER = Path(__file__).parents[2] / "docker"
 COMPOSE = DOCKER / "compose.yaml"
 BIN = Path(sys.executable).parent
@@ -72,7 +74,7 @@ def entry(tmp_path):
     """Run the entry point with stand-ins for dask, mlflow and rtgs that print what they were called with."""
     for name in ("dask", "mlflow", "rtgs"):
         path = tmp_path / name
-        path.write_text(f'#!/bin/sh\necho "{name} $* OMP=${{OMP_NUM_THREADS:-}}"\n')
+        path.write_text(f'#!/bin/sh\necho "{name} $* OMP=${{OMP_NUM_THREADS:-}} TRIM=${{MALLOC_TRIM_THRESHOLD_:-}}"\n')
         path.chmod(0o755)
 
     def run(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -92,6 +94,7 @@ def test_worker_has_one_step_at_a_time_and_its_threads(entry):
     out = entry("worker", RTGS_SCHEDULER="tcp://s:8786", RTGS_THREADS="3").stdout
     assert out.startswith("dask worker tcp://s:8786 --nworkers 1 --nthreads 1")
     assert "OMP=3" in out
+    assert f"TRIM={worker_environment(3)['MALLOC_TRIM_THRESHOLD_']}" in out
 
 
 def test_tracking_server_takes_its_secrets_from_the_environment_only(entry):

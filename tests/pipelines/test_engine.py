@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import platform
 import signal
 import subprocess
 import sys
@@ -160,6 +161,32 @@ def _count_threads(params: ToyParams, context) -> None:
 
     text = f"{torch.get_num_threads()} {os.environ['OMP_NUM_THREADS']}"
     (context.out / "threads.txt").write_text(text)
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the allocator's settings are those of glibc")
+def test_workers_keep_the_buffers_of_a_step_for_the_next(tmp_path, cluster):
+    outcomes = attempt(cluster, tmp_path, Step("count", 1, ToyParams(0.0, str(tmp_path)), _count_faults))
+    (outcome,) = outcomes.outcomes.values()
+    assert outcome.folder is not None
+    faults, pages = map(int, (outcome.folder / "faults.txt").read_text().split())
+    assert faults < pages / 4  # with Dask's trim threshold: every page, every time
+
+
+def _count_faults(params: ToyParams, context) -> None:
+    import resource
+
+    import torch
+
+    def faults() -> int:
+        return resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+
+    size, times = 16 << 20, 20
+    before = faults()
+    for turn in range(2 * times):
+        before = faults() if turn == times else before  # the first ones find the places
+        torch.ones(size, dtype=torch.uint8)
+    pages = times * size // resource.getpagesize()
+    (context.out / "faults.txt").write_text(f"{faults() - before} {pages}")
 
 
 @pytest.mark.parametrize(
