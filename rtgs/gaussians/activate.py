@@ -48,7 +48,7 @@ def activate_geometry(surfels: Gaussians) -> ActivatedSurfels:
     For the tracer, which evaluates colours itself, at the direction of each ray.
     """
     raw = [getattr(surfels, field.name) for field in fields(Gaussians)]
-    raw[4], raw[5] = raw[4].detach(), raw[5].detach()
+    raw[4], raw[5] = raw[4].detach(), raw[5].new_empty(len(raw[5]), 0, 3)
     return ActivatedSurfels(surfels.means, *_Activate.apply((0.0, 0.0, 0.0), 0, *raw))
 
 

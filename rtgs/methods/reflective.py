@@ -174,14 +174,16 @@ class ReflectiveMethod(SurfelMethod):
         view = rays.directions.reshape(-1, 3).T
         chosen = self._choose(flat, buffers, view, glass, training=options is None)
         pixels = _take(flat, chosen.index)
-        mirrored = mirror_rays(pixels, rays.origin, view[:, chosen.index], self.settings.reflection.sh_direction)
+        seen = view.index_select(1, chosen.index)
+        mirrored = mirror_rays(pixels, rays.origin, seen, self.settings.reflection.sh_direction)
         ahead = self.reflection.density.needs_signal and densify_ahead(self.plan.reflection, step)
         watched = options is None and ahead
-        traced = self.reflection.trace(
-            mirrored.origins, mirrored.directions, self._trace_options(step, watched), watched=watched
-        )
+        origins, directions = mirrored.origins, mirrored.directions
+        if chosen.shared is not None:
+            origins, directions = (rows.index_select(0, chosen.shared.own) for rows in (origins, directions))
+        traced = self.reflection.trace(origins, directions, self._trace_options(step, watched), watched=watched)
         assert traced.colors is not None
-        color = traced.colors.T
+        color = (traced.colors if chosen.shared is None else traced.colors.index_select(0, chosen.shared.ray)).T
         weights = pixel_weights(mirrored.cosine, pixels, self.settings.optics)
         gain = self.settings.transmittance.max_gain
         if glass is not None and gain is not None:
@@ -231,12 +233,14 @@ class ReflectiveMethod(SurfelMethod):
         surface = (buffers.alpha.flatten() > settings.smallest_alpha) & (flat.depth > 0)
         surface &= flat.normal.square().sum(0) > SHORTEST_NORMAL**2
         showing = None
-        if settings.traced.threshold > 0:
-            unit = flat.normal / flat.normal.square().sum(0).sqrt().clamp_min(SHORTEST_NORMAL)
-            cosine = -(unit * view).sum(0) / view.square().sum(0).sqrt()
-            weight = pixel_weights(cosine, flat, self.settings.optics).reflection
-            weight = weight if weight.ndim == 1 else weight.amax(0)
-            showing = flat.specular * weight.clamp_min(1)
+        if settings.traced.threshold > 0 or (training and settings.traced.shared_below > 0):
+            showing = flat.specular
+            if not self.settings.optics.at_most_one:
+                unit = flat.normal / flat.normal.square().sum(0).sqrt().clamp_min(SHORTEST_NORMAL)
+                cosine = -(unit * view).sum(0) / view.square().sum(0).sqrt()
+                weight = pixel_weights(cosine, flat, self.settings.optics).reflection
+                weight = weight if weight.ndim == 1 else weight.amax(0)
+                showing = showing * weight.clamp_min(1)
             showing = (showing if glass is None else showing.masked_fill(glass.inside, torch.inf)).reshape(
                 buffers.alpha.shape
             )

@@ -156,21 +156,16 @@ inline void PacketTracer::load_waiting(int rows) {
   }
 }
 
-// Runs of equal t within a lane, put in the order of the surfels' ids.
+// Runs of equal t within a lane, put in the order of the surfels' ids. Copies that density control made are such runs.
 inline void PacketTracer::order_ties(int rows) {
-  uint32_t lanes = 0;
   for (int row = 0; row + 1 < rows; ++row) {
     const vfloat t = load(work_.sorted_t.data + row * kLanes), next = load(work_.sorted_t.data + (row + 1) * kLanes);
-    lanes |= mask_bits(eq(t, next) & lt(t, broadcast(kFarAway)));
-  }
-  for (; lanes; lanes &= lanes - 1) {
-    const int lane = __builtin_ctz(lanes);
-    const float* t = work_.sorted_t.data + lane;
-    int32_t* places = work_.sorted_places.data + lane;
-    for (int i = 1; i < rows && t[i * kLanes] < kFarAway; ++i) {
-      const int32_t place = places[i * kLanes], id = record_id(record(work_.slots[place]));
-      int to = i;
-      for (; to > 0 && t[(to - 1) * kLanes] == t[i * kLanes] &&
+    for (uint32_t lanes = mask_bits(eq(t, next) & lt(t, broadcast(kFarAway))); lanes; lanes &= lanes - 1) {
+      const int lane = __builtin_ctz(lanes);
+      int32_t* places = work_.sorted_places.data + lane;
+      const int32_t place = places[(row + 1) * kLanes], id = record_id(record(work_.slots[place]));
+      int to = row + 1;
+      for (; to > 0 && work_.sorted_t.data[(to - 1) * kLanes + lane] == t[lane] &&
              record_id(record(work_.slots[places[(to - 1) * kLanes]])) > id; --to)
         places[to * kLanes] = places[(to - 1) * kLanes];
       places[to * kLanes] = place;

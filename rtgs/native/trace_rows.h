@@ -45,6 +45,7 @@ static inline SurfelHits surfel_hits(vmask met, vfloat w, uint64_t clamped) {
   SurfelHits hits;
   hits.lanes = mask_bits(met);
   store(hits.weights, w);
+  clamped &= hits.lanes * 0x000100010001ull;  // what the other rays would see does not matter
   hits.clamped = clamped != 0;
   if (hits.clamped)
     for (uint32_t left = hits.lanes; left; left &= left - 1) {

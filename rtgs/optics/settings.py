@@ -38,3 +38,8 @@ class OpticsSettings:
         for name in ("roughness_floor", "cosine_floor", "literal_cosine_floor"):
             if not 0 < getattr(self, name) <= 1:
                 raise ValueError(f"method.optics.{name}={getattr(self, name)} must be above 0 and at most 1")
+
+    @property
+    def at_most_one(self) -> bool:
+        """Whether w_r can never exceed 1: energy is conserved."""
+        return self.weight in ("split_sum", "envgs") or (self.weight == "microfacet" and 0 < self.max_gain <= 1)

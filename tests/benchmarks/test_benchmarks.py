@@ -23,6 +23,7 @@ from benchmarks import (
     trace_levers,
     trace_scene,
     train_step,
+    training_parts,
     training_runs,
 )
 from rtgs.native import core
@@ -122,6 +123,20 @@ def test_train_step(run) -> None:
     assert figures["step_over_raster"] > 0
     assert all(figures[f"{part}_ms"] > 0 for part in parts)
     assert math.isclose(sum(figures[f"share_{part}"] for part in (*parts, "rest")), 1, abs_tol=0.01)
+
+
+def test_training_parts(run) -> None:
+    words = ("--preset", "smoke", "--steps", "24", "--set", "scene.long_side=48", "method.reflection.matte.probation=0")
+    figures = run(training_parts, "--scene", "spheres", *words)
+    diffuse, reflection = figures["stages"]
+    assert [stage["stage"] for stage in figures["stages"]] == ["diffuse", "reflection"]
+    assert {"raster", "losses", "adam", "shading"} <= set(diffuse["shares"])
+    assert {"trace", "tree", "choose"} <= set(reflection["shares"])
+    assert diffuse["rays"] == 0
+    assert reflection["rays"] > 0
+    for stage in figures["stages"]:
+        assert math.isclose(sum(stage["shares"].values()), 1, abs_tol=1e-6)
+        assert stage["fixed"] > 0
 
 
 def test_captures(run, tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from rtgs.methods.reflective import ReflectiveMethod
 from rtgs.optics.microfacet import specular_weights
 from rtgs.train.checkpoint import checkpoint_path
 from rtgs.train.settings import MethodSettings, ReflectionSettings
-from rtgs.train.specular_settings import MatteSettings, PropagationSettings, TracedShareSettings
+from rtgs.train.specular_settings import MaterialSettings, MatteSettings, PropagationSettings, TracedShareSettings
 from rtgs.train.trainer import Trainer
 
 TESTS = Path(__file__).parent
@@ -170,7 +170,31 @@ def test_what_is_not_traced_at_a_test_view_is_the_diffuse_colour():
     assert torch.equal(rendered.image, rendered.layers.diffuse)
 
 
-@pytest.mark.parametrize("traced", [TracedShareSettings(), SAMPLED])
+def test_pixels_that_share_a_ray_show_the_colour_that_one_of_their_block_would():
+    settings = replace(
+        recipe("envgs", traced=TracedShareSettings(shared_below=2.0)), materials=MaterialSettings(specular=0.3)
+    )
+    method, made = in_second_stage(settings, steps=17)
+    camera = made.scene.train[0].camera
+    with torch.no_grad():
+        shared = method.render(camera, 32).image
+        layers = method.render(camera, 32, RenderOptions(layers=True)).layers
+    assert layers is not None
+
+    def blocks(maps: torch.Tensor) -> torch.Tensor:  # (C, blocks, 4)
+        return maps.unfold(1, 2, 2).unfold(2, 2, 2).flatten(3).flatten(1, 2)
+
+    specular, diffuse, color = (blocks(m) for m in (layers.specular[None], layers.diffuse, layers.reflected_color))
+    known = blocks(layers.traced[None].float()).min(dim=2).values[0] == 1
+    # (C, blocks, pixel, whose ray)
+    each = diffuse[..., None] + specular[..., None] * (color[:, :, None, :] - diffuse[..., None])
+    worst = (each - blocks(shared)[..., None]).abs().amax(dim=(0, 2))[known]  # of a block, by whose ray
+    assert int(known.sum()) > 20
+    assert float(worst.min(dim=1).values.max()) < 1e-5
+    assert int((worst < 1e-5).sum(dim=1).ne(4).sum()) > 20  # the four would differ
+
+
+@pytest.mark.parametrize("traced", [TracedShareSettings(), SAMPLED, TracedShareSettings(shared_below=0.5)])
 def test_state_goes_round_in_the_middle_of_the_second_stage(traced: TracedShareSettings):
     method, made = in_second_stage(recipe(traced=traced), steps=17)
     state = {name: tensor.clone() for name, tensor in method.state().items()}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from rtgs.methods.traced_pixels import choose_pixels, tile_order
+from rtgs.methods.traced_pixels import choose_pixels, share_rays, tile_order
 from rtgs.train.specular_settings import TracedShareSettings
 
 
@@ -55,3 +55,45 @@ def test_the_rest_is_drawn_in_whole_tiles_with_the_share_asked_for():
         assert bool(((tiles == 0) | (tiles == 1)).all())
         counts.append(float(tiles.mean()))
     assert sum(counts) / len(counts) == pytest.approx(0.25, abs=0.03)
+
+
+@pytest.mark.parametrize(("width", "height"), [(16, 8), (13, 7), (1, 1)])
+def test_the_pixels_of_a_quad_are_a_block_of_the_image(width: int, height: int):
+    order = tile_order(width, height, 8)
+    x, y = order.index % width, order.index // width
+    assert torch.equal(order.corner, y % 2 * 2 + x % 2)
+    blocks = torch.stack((y // 2, x // 2), dim=1)
+    for quad in order.quad.unique():
+        assert len(blocks[order.quad == quad].unique(dim=0)) == 1
+    assert len(order.quad.unique()) == len(blocks.unique(dim=0))
+
+
+def test_pixels_below_the_border_share_the_ray_of_one_of_them_and_each_gets_its_turn():
+    showing = torch.rand(24, 32, generator=torch.Generator().manual_seed(0))
+    surface = torch.ones(24, 32, dtype=torch.bool)
+    surface[3:9, 5:12] = False
+    settings, generator = TracedShareSettings(shared_below=0.6), torch.Generator().manual_seed(1)
+    order = tile_order(32, 24, settings.tile)
+    quad_of = torch.empty(24 * 32, dtype=torch.int64).scatter_(0, order.index, order.quad)
+    leaders = torch.zeros(24 * 32)
+    for _ in range(40):
+        chosen = choose_pixels(surface, showing, settings, generator)
+        assert chosen.shared is not None
+        assert chosen.emphasis is None
+        assert torch.equal(chosen.index.sort().values, surface.flatten().nonzero()[:, 0])
+        sender = chosen.index[chosen.shared.own][chosen.shared.ray]  # whose ray each pixel shows
+        low = showing.flatten()[chosen.index] < 0.6
+        assert torch.equal(sender[~low], chosen.index[~low])
+        assert torch.equal(quad_of[sender], quad_of[chosen.index])
+        assert bool((showing.flatten()[sender[low]] < 0.6).all())
+        assert len(sender[low].unique()) == len(quad_of[chosen.index[low]].unique())
+        assert len(chosen.shared.own) == len(sender.unique())
+        leaders[sender.unique()] += 1
+    assert bool((leaders[surface.flatten()] > 0).all())
+    assert choose_pixels(surface, showing, settings, None).shared is None
+
+
+def test_no_pixels_share_no_rays():
+    nothing = torch.empty(0, dtype=torch.int64)
+    shared = share_rays(nothing.bool(), nothing, nothing)
+    assert len(shared.own) == len(shared.ray) == 0

@@ -120,6 +120,12 @@ def test_the_weights_are_those_of_the_memo():
         assert 0.94 < float(bounded / free) <= 1
 
 
+def test_only_weights_that_conserve_energy_are_known_to_stay_below_one():
+    open_gains = (replace(DEFAULT, max_gain=16.0), replace(DEFAULT, max_gain=0.0), OpticsSettings(weight="literal"))
+    assert not any(optics.at_most_one for optics in open_gains)
+    assert OpticsSettings(weight="envgs", max_gain=16.0).at_most_one
+
+
 def test_literal_diverges_where_the_cosine_form_does_not():
     grazing = f64(0.1), f64(0.3), f64(0.04)
     literal = specular_weights(*grazing, OpticsSettings(weight="literal"))
@@ -133,6 +139,7 @@ def test_energy_is_conserved(optics: OpticsSettings):
     axis = torch.linspace(0, 1, 41, dtype=torch.float64)
     cosine, roughness, f0 = torch.meshgrid(axis, axis, axis, indexing="ij")
     weights = specular_weights(cosine, roughness, f0, optics)
+    assert optics.at_most_one
     assert float((weights.reflection + weights.transmission).max()) <= 1 + 1e-12
     assert float(weights.reflection.min()) >= 0
     assert float(weights.transmission.min()) >= -1e-12

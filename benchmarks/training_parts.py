@@ -1,0 +1,230 @@
+"""Where the time of a training goes, part by part: ``python -m benchmarks.training_parts --scene NAME``.
+
+The whole training runs, every stage, as ``rtgs run`` would train it, with a clock around each part of a step: the
+rasteriser, the tracer, its tree, activation of parameters, losses, Adam, density control. What is left is ``shading``:
+pixels to rays, microfacet weights, blend, autograd, the loop. ``fixed``: how much of all is Python and calls, by a step
+on a picture 16 pixels wide and some hundred surfels. A part's clock stops while a part inside of it runs, so shares add
+up to 1. Seconds are CPU seconds of one thread; with ``--threads 2`` wall seconds. The third stage is left out.
+A Markdown table, then a JSON object as the last line.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from statistics import median
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from benchmarks.training_runs import schedule_overrides
+
+if TYPE_CHECKING:
+    from rtgs.methods import Method, Stage
+    from rtgs.scenes.scene import Scene
+
+PARTS = ("raster", "trace", "tree", "activate", "losses", "adam", "density", "choose", "shading")
+SMALL_WIDTH, SMALL_ROWS, SMALL_STEPS = 16, 100, 30  # of the step that measures the fixed cost
+
+
+@dataclass(frozen=True)
+class StageShares:
+    """One stage of a training."""
+
+    stage: str
+    steps: int
+    seconds: float
+    shares: dict[str, float]  # by part; they add up to 1
+    fixed: float  # share of what a step costs without pixels and surfels; contained in the others
+    rays: float  # mean number of mirror rays a step
+    hits: float  # mean number of hits a mirror ray
+    surfels: dict[str, int]  # by set, at the end
+
+
+class PartClock:
+    """Seconds by part; a part's clock stops while another runs inside of it."""
+
+    def __init__(self, now: Callable[[], float]) -> None:
+        self._now = now
+        self._running: list[str] = []
+        self._since = 0.0
+        self.seconds: dict[str, float] = defaultdict(float)
+        self.rays = self.hits = 0
+
+    def _switch(self) -> None:
+        now = self._now()
+        if self._running:
+            self.seconds[self._running[-1]] += now - self._since
+        self._since = now
+
+    @contextmanager
+    def part(self, name: str) -> Iterator[None]:
+        self._switch()
+        self._running.append(name)
+        try:
+            yield
+        finally:
+            self._switch()
+            self._running.pop()
+
+    def wrap(self, owner: Any, name: str, part: str) -> tuple[Any, str, Any]:
+        """Put the clock around ``owner.name``; returns what undoes it."""
+        before = vars(owner)[name]
+        inner = before.__func__ if isinstance(before, staticmethod) else before
+
+        def timed(*args, **kwargs):
+            with self.part(part):
+                result = inner(*args, **kwargs)
+            native = getattr(args[0], "native", None) if part == "trace" and name == "forward" else None
+            if native is not None:  # in training only, where a tape is kept
+                self.rays += len(args[9])
+                self.hits += native.hits
+            return result
+
+        setattr(owner, name, staticmethod(timed) if isinstance(before, staticmethod) else timed)
+        return owner, name, before
+
+
+@contextmanager
+def clocks(clock: PartClock) -> Iterator[None]:
+    """Every part of a step under its clock."""
+    from rtgs.gaussians import activate
+    from rtgs.gaussians.density import DensityControl
+    from rtgs.methods.reflective import ReflectiveMethod
+    from rtgs.methods.surfel_base import SurfelMethod
+    from rtgs.methods.surfel_set import SurfelSet
+    from rtgs.methods.traced_set import FollowingTree
+    from rtgs.render import ellipsoids, rasterize, trace
+    from rtgs.train import losses
+    from rtgs.train.adam import SurfelAdam
+
+    functions = [
+        (rasterize._Rasterize, "raster"),
+        (ellipsoids._Rasterize, "raster"),
+        (trace._Trace, "trace"),
+        (activate._Activate, "activate"),
+        (losses._Photometric, "losses"),
+        (losses._NormalConsistency, "losses"),
+        (losses._MonoNormal, "losses"),
+    ]
+    wanted = [(owner, name, part) for owner, part in functions for name in ("forward", "backward")]
+    wanted += [
+        (FollowingTree, "current", "tree"),
+        (SurfelMethod, "losses", "losses"),
+        (ReflectiveMethod, "losses", "losses"),
+        (SurfelAdam, "step", "adam"),
+        (SurfelSet, "_clamp", "adam"),
+        (SurfelSet, "densify", "density"),
+        (DensityControl, "observe", "density"),
+        (ReflectiveMethod, "_choose", "choose"),
+    ]
+    undo = [clock.wrap(*entry) for entry in wanted]
+    try:
+        yield
+    finally:
+        for owner, name, before in undo:
+            setattr(owner, name, before)
+
+
+def stage_shares(method: Method, scene: Scene, seed: int, now: Callable[[], float]) -> list[StageShares]:
+    """Train every stage of the method under the clocks."""
+    from rtgs.train.trainer import Trainer
+
+    found = []
+    for stage in method.stages:
+        clock = PartClock(now)
+        trainer = Trainer(method, scene, seed=seed, stage=stage)
+        with clocks(clock), clock.part("shading"):
+            trainer.run()
+        seconds = sum(clock.seconds.values())
+        steps = stage.until - stage.from_step
+        fixed = steps * fixed_seconds(method, scene, stage, now)
+        shares = {part: clock.seconds[part] / seconds for part in PARTS if clock.seconds[part] > 0}
+        surfels = {part.name: len(part) for part in method.sets}
+        rays, hits = clock.rays / steps, clock.hits / max(clock.rays, 1)
+        found.append(StageShares(stage.name, steps, seconds, shares, fixed / seconds, rays, hits, surfels))
+    return found
+
+
+def fixed_seconds(method: Method, scene: Scene, stage: Stage, now: Callable[[], float]) -> float:
+    """Median seconds of a step with next to nothing in it: a picture 16 pixels wide, sets of some hundred surfels."""
+    from rtgs.methods import create_method
+    from rtgs.train.seeds import generator_for
+
+    view = scene.train[0]
+    height = max(4, round(view.camera.height * SMALL_WIDTH / view.camera.width))
+
+    def shrunk(maps: torch.Tensor | None) -> torch.Tensor | None:
+        return None if maps is None else maps[..., :height, :SMALL_WIDTH].contiguous()
+
+    camera = view.camera.resized(SMALL_WIDTH, height)
+    small = replace(view, camera=camera, image=shrunk(view.image), mask=None, normal=shrunk(view.normal))
+    points, colors = scene.points[:SMALL_ROWS], scene.point_colors[:SMALL_ROWS]
+    little = replace(scene, train=(small,), test=(), points=points, point_colors=colors)
+    settings = replace(method.settings, reflection=replace(method.settings.reflection, cells=3))
+    other = create_method(settings, little, method.schedule, generator_for(0, "initialise"))
+    if len(method.sets) > 1:
+        other.begin(stage)
+    times = []
+    for _ in range(SMALL_STEPS):
+        start = now()
+        rendered = other.render(camera, stage.until - 1, None, None)
+        other.losses(rendered, small, stage.until - 1).total.backward()
+        for part in other.sets:
+            part.step(stage.until - 1, 3)
+        times.append(now() - start)
+    return median(times)
+
+
+def measure(words: Sequence[str], threads: int) -> list[StageShares]:
+    """Compose, load, train under the clocks."""
+    from rtgs.config.compose import compose
+    from rtgs.methods import create_method
+    from rtgs.scenes.scene import load_scene
+    from rtgs.train.seeds import generator_for
+
+    torch.set_num_threads(threads)
+    config, _ = compose(list(words))
+    scene = replace(load_scene(config.scene), test=())
+    method = create_method(config.method, scene, config.schedule, generator_for(config.seed, "initialise"))
+    return stage_shares(method, scene, config.seed, time.thread_time if threads == 1 else time.perf_counter)
+
+
+def table(stages: Sequence[StageShares]) -> str:
+    """Markdown, a row per stage."""
+    parts = [part for part in PARTS if any(part in stage.shares for stage in stages)]
+    lines = ["| stage | steps | s | ms a step | " + " | ".join(parts) + " | fixed | rays | hits a ray |"]
+    lines.append("|" + "---|" * (len(parts) + 7))
+    for stage in stages:
+        cells = [stage.stage, f"{stage.steps:,}", f"{stage.seconds:.0f}", f"{1e3 * stage.seconds / stage.steps:.1f}"]
+        cells += [f"{100 * stage.shares.get(part, 0):.0f} %" for part in parts]
+        cells += [f"{100 * stage.fixed:.0f} %", f"{stage.rays:,.0f}", f"{stage.hits:.0f}"]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scene", default="spheres")
+    parser.add_argument("--method", default="rtgs")
+    parser.add_argument("--preset", default="quick")
+    parser.add_argument("--steps", type=int, help="shrink the preset's schedule")
+    parser.add_argument("--set", nargs="*", default=[], help="config words")
+    parser.add_argument("--threads", type=int, default=1)
+    options = parser.parse_args()
+    words = [f"scene={options.scene}", f"method={options.method}", f"preset={options.preset}", *options.set]
+    words += schedule_overrides(options.steps, options.preset) if options.steps else []
+    stages = measure(words, options.threads)
+    print(table(stages))
+    result = {"scene": options.scene, "method": options.method, "preset": options.preset, "threads": options.threads}
+    result |= {"seconds": round(sum(stage.seconds for stage in stages), 1), "stages": [asdict(s) for s in stages]}
+    print(json.dumps(result))
+
+
+if __name__ == "__main__":
+    main()
