@@ -1,7 +1,8 @@
 """One mirror ray per pixel: from rasterised maps to rays, and from traced colours to the image (methods.md 3.3, 4).
 
-Plain torch in the dtype of the inputs; every step is differentiable, so the reflection's loss teaches the surface its
-normals (through the direction), its depth (through the origin) and its materials (through the weights).
+In the dtype of the inputs: float32 by native kernels where that pays, any other dtype in plain torch, their twin. Every
+step is differentiable, so the reflection's loss teaches the surface its normals (through the direction), its depth
+(through the origin) and its materials (through the weights).
 """
 
 from __future__ import annotations
@@ -10,8 +11,11 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
+from rtgs.native import core
 from rtgs.optics.microfacet import SpecularWeights, specular_weights
+from rtgs.optics.reflection import reflection_weight
 from rtgs.optics.settings import OpticsSettings
 from rtgs.train.specular_settings import MaterialSettings
 
@@ -62,6 +66,15 @@ def mirror_rays(pixels: SurfacePixels, center: Tensor, view: Tensor, length: str
 
     ``length`` of the mirror rays: "unit", or "raw": as long as the ray they come from (register row 23).
     """
+    maps = (pixels.normal, pixels.depth, view, center)
+    if all(m.dtype == torch.float32 and m.device.type == "cpu" for m in maps):
+        numbers = (tuple(center.tolist()), SHORTEST_NORMAL, length == "raw")
+        return MirrorRays(*_Mirror.apply(pixels.normal, pixels.depth, view, numbers))  # type: ignore[misc]
+    return mirror_rays_twin(pixels, center, view, length)
+
+
+def mirror_rays_twin(pixels: SurfacePixels, center: Tensor, view: Tensor, length: str = "unit") -> MirrorRays:
+    """:func:`mirror_rays` in plain torch, any dtype."""
     length_of_view = view.square().sum(0).sqrt()  # over three rows, many times faster than norm(dim=0)
     outward = -view / length_of_view  # omega_o
     normal = pixels.normal * pixels.normal.square().sum(0).clamp_min(SHORTEST_NORMAL**2).rsqrt()
@@ -78,6 +91,13 @@ def pixel_weights(cosine: Tensor, pixels: SurfacePixels, optics: OpticsSettings)
         return specular_weights(cosine, pixels.roughness, pixels.f0, optics)
     weights = specular_weights(cosine, pixels.roughness, pixels.f0.T, optics)
     return SpecularWeights(weights.reflection.T, weights.transmission.T, weights.fresnel.T)
+
+
+def reflected_weight(cosine: Tensor, pixels: SurfacePixels, optics: OpticsSettings) -> Tensor:
+    """``pixel_weights(...).reflection`` without the other two."""
+    if pixels.f0.ndim == 1:
+        return reflection_weight(cosine, pixels.roughness, pixels.f0, optics)
+    return reflection_weight(cosine, pixels.roughness, pixels.f0.T, optics).T
 
 
 def specular_change(pixels: SurfacePixels, light: Tensor, emphasis: Tensor | None) -> Tensor:
@@ -101,3 +121,25 @@ class _Emphasize(torch.autograd.Function):
     def backward(ctx, upstream: Tensor):  # type: ignore[override]
         (emphasis,) = ctx.saved_tensors
         return upstream * emphasis, None
+
+
+class _Mirror(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, normal: Tensor, depth: Tensor, view: Tensor, numbers: tuple[tuple[float, ...], float, bool]):
+        maps = [m.detach().contiguous() for m in (normal, depth, view)]
+        count = len(depth)
+        outputs = (torch.empty(count, 3), torch.empty(count, 3), torch.empty(count))
+        arrays = [m.numpy() for m in maps]
+        core.mirror_rays(*arrays, *numbers, *(o.numpy() for o in outputs), torch.get_num_threads())
+        ctx.save_for_backward(*maps)
+        ctx.numbers = numbers
+        return outputs
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, *upstream: Tensor):  # type: ignore[override]
+        maps = [m.numpy() for m in ctx.saved_tensors]
+        normal, depth = (torch.empty_like(m) for m in ctx.saved_tensors[:2])
+        given = (g.contiguous().numpy() for g in upstream)
+        core.mirror_rays_backward(*maps, *ctx.numbers, *given, normal.numpy(), depth.numpy(), torch.get_num_threads())
+        return normal, depth, None, None

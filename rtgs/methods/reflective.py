@@ -30,9 +30,11 @@ from rtgs.methods.glass import GlassPixels, GlassRays, Transmission, glass_rays
 from rtgs.methods.matte import MatteEvidence, gather_evidence
 from rtgs.methods.mirror import (
     SHORTEST_NORMAL,
+    MirrorRays,
     SurfacePixels,
     mirror_rays,
     pixel_weights,
+    reflected_weight,
     specular_change,
     surface_pixels,
 )
@@ -184,33 +186,37 @@ class ReflectiveMethod(SurfelMethod):
         traced = self.reflection.trace(origins, directions, self._trace_options(step, watched), watched=watched)
         assert traced.colors is not None
         color = (traced.colors if chosen.shared is None else traced.colors.index_select(0, chosen.shared.ray)).T
-        weights = pixel_weights(mirrored.cosine, pixels, self.settings.optics)
-        gain = self.settings.transmittance.max_gain
-        if glass is not None and gain is not None:
-            bounded = replace(self.settings.optics, max_gain=gain)
-            reflection = pixel_weights(mirrored.cosine, pixels, bounded).reflection
-            weights = replace(
-                weights, reflection=torch.where(glass.inside[chosen.index], reflection, weights.reflection)
-            )
-        light, passed = weights.reflection * color, None
+        reflection, transmission = self._weights(
+            mirrored, pixels, None if glass is None else glass.inside[chosen.index]
+        )
+        light, passed = reflection * color, None
         if glass is not None:
             passed = self.transmit(glass, glass_rays(glass, chosen.index, rays.origin, view), step, options)
-            light = light + weights.transmission * passed.color
+            light = light + transmission * passed.color
         change = specular_change(pixels, light, chosen.emphasis)
         shape = (3, camera.height, camera.width)
         image = flat.diffuse.index_add(1, chosen.index, change).reshape(shape)
         specular = flat.specular.reshape(shape[1:])
         layers = None
         if options is not None and options.layers:
-            layers = _layers(flat, chosen, pixels.specular * weights.reflection * color, color, shape)
+            layers = _layers(flat, chosen, pixels.specular * reflection * color, color, shape)
         if glass is None or passed is None:
             return RenderedView(camera, image, buffers, layers, specular)
         if layers is not None:
-            through = pixels.specular * weights.transmission * passed.color
+            through = pixels.specular * transmission * passed.color
             both = (_full(values.detach(), chosen, shape) for values in (through, passed.color))
             layers = replace(layers, **dict(zip(("transmission", "transmitted_color"), both, strict=True)))
-        inside = glass.inside.reshape(shape[1:])
-        return RenderedView(camera, image, buffers, layers, specular, passed.first_bounce, inside)
+        seen_through = glass.inside.reshape(shape[1:])
+        return RenderedView(camera, image, buffers, layers, specular, passed.first_bounce, seen_through)
+
+    def _weights(self, rays: MirrorRays, pixels: SurfacePixels, glass: Tensor | None) -> tuple[Tensor, Tensor]:
+        """w_r and w_t of the traced pixels; ``glass`` (P,) bool: they show a transparent object, None: none does."""
+        optics, gain = self.settings.optics, self.settings.transmittance.max_gain
+        reflection = reflected_weight(rays.cosine, pixels, optics)
+        if glass is None:
+            return reflection, torch.zeros(())
+        inside = pixel_weights(rays.cosine, pixels, optics if gain is None else replace(optics, max_gain=gain))
+        return torch.where(glass, inside.reflection, reflection), inside.transmission
 
     def _flat_pixels(self, buffers: RasterBuffers) -> SurfacePixels:
         """Every pixel of the view, flattened."""

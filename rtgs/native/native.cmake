@@ -6,6 +6,7 @@ set(RTGS_KERNELS
   normal_kernels.cpp
   surfel_kernels.cpp
   optimizer_kernels.cpp
+  mirror_kernels.cpp
   project_kernels.cpp
   project_backward.cpp
   raster_bins.cpp
@@ -26,6 +27,7 @@ set(RTGS_BINDINGS
   bind_image.cpp
   bind_surfels.cpp
   bind_optimizer.cpp
+  bind_mirror.cpp
   bind_raster.cpp
   bind_ellipsoids.cpp
   bvh_tree.cpp
