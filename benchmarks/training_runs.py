@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -61,8 +61,13 @@ def schedule_overrides(steps: int, preset: str) -> list[str]:
     return [f"schedule.{name}={value}" for name, value in values.items()]
 
 
-def train_run(overrides: Sequence[str], long_side: int | None = None) -> TrainedRun:
-    """Compose, load and train, stage by stage; ``long_side`` shrinks the views further than the preset does."""
+def train_run(
+    overrides: Sequence[str], long_side: int | None = None, change: Callable[[Scene], Scene] | None = None
+) -> TrainedRun:
+    """Compose, load and train, stage by stage; ``long_side`` shrinks the views further than the preset does.
+
+    ``change`` is given the loaded scene and returns the one to train and to judge on.
+    """
     from rtgs.config.compose import compose
     from rtgs.methods import create_method
     from rtgs.scenes.scene import load_scene
@@ -71,6 +76,7 @@ def train_run(overrides: Sequence[str], long_side: int | None = None) -> Trained
 
     config, _ = compose(list(overrides))
     scene = load_scene(config.scene if long_side is None else replace(config.scene, long_side=long_side))
+    scene = scene if change is None else change(scene)
     reset_peak_memory()
     method = create_method(config.method, scene, config.schedule, generator_for(config.seed, "initialise"))
     unseen = replace(scene, test=())  # no test views: their time is not training

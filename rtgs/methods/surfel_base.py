@@ -14,6 +14,7 @@ from rtgs.gaussians.initialize import gaussians_from_points
 from rtgs.gaussians.primitives import Gaussians
 from rtgs.gaussians.surfels import ActivatedSurfels, Surfels
 from rtgs.methods.base import Decision, LossTerm, LossTerms, RenderedView, RenderOptions, Stage, StepEvent
+from rtgs.methods.pixel_bound import bound_by_pixels
 from rtgs.methods.surfel_set import SurfelSet
 from rtgs.render.buffers import RasterBuffers, RasterOptions
 from rtgs.render.rasterize import rasterize_surfels
@@ -66,6 +67,8 @@ class SurfelMethod:
         self, settings: MethodSettings, scene: Scene, schedule: ScheduleSettings, generator: torch.Generator
     ) -> None:
         check_schedule(schedule)
+        pixels = max((view.camera.width * view.camera.height for view in scene.train), default=0)
+        settings, lowered = bound_by_pixels(settings, pixels)
         self.settings = settings
         self.schedule = schedule
         self.base_schedule = schedule  # of the base set's density control: a later stage may end it early
@@ -85,7 +88,7 @@ class SurfelMethod:
         )
         self.stages = self.declare_stages(settings, schedule)
         self.starts, decisions = _decide_losses(settings, scene, schedule)
-        self.decisions: tuple[Decision, ...] = (*decisions, *_decide_density(settings, schedule))
+        self.decisions: tuple[Decision, ...] = (*decisions, *_decide_density(settings, schedule), *lowered)
         self._background = torch.tensor(settings.render.background)
 
     @staticmethod

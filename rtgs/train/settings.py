@@ -131,6 +131,9 @@ class DensitySettings:
     low_weight_share: float = 0.1  # too large and among the lowest 10 % of mean weight: pruned instead of split
     reset_opacity: float = 0.01
     max_surfels: int = 2_000_000
+    # The cap is at most this times the pixels of the largest training view (more cannot be told apart, and fit noise);
+    # None: no such bound, as published.
+    max_per_pixel: float | None = None
     cap_share: float = 0.9  # above this share of max_surfels (the cap) the lowest mean weights go
     # Share of the cap that one call may add beyond it, highest signals first, before the lowest weights go. None: any
     # number, as in EnvGS, which hardly meets its cap; presets with a small cap set it, or half of their set would
@@ -142,6 +145,8 @@ class DensitySettings:
         if self.strategy not in DENSITY_STRATEGIES:
             known = ", ".join(DENSITY_STRATEGIES)
             raise ValueError(f"method.density.strategy={self.strategy!r} must be one of {known}")
+        if self.max_per_pixel is not None:
+            refuse_unless(self.max_per_pixel > 0, "density.max_per_pixel", self.max_per_pixel, "above 0, or null")
 
 
 @dataclass(frozen=True)
