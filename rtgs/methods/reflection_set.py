@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import torch
 from torch import Tensor
 
@@ -12,6 +14,8 @@ from rtgs.methods.surfel_set import SurfelSet
 from rtgs.methods.traced_set import FollowingTree, stratified_surfels, trace_set
 from rtgs.render.buffers import TraceBuffers, TraceOptions
 from rtgs.train.settings import DensitySettings, OptimizerSettings, ReflectionSettings
+
+PIXEL_STRIDE = 37  # of the training pixels that a scene's colour is taken from
 
 
 class ReflectionSet(SurfelSet):
@@ -82,11 +86,23 @@ def reflection_box(settings: ReflectionSettings, points: Tensor, extent: float) 
 
 
 def reflection_surfels(
-    settings: ReflectionSettings, points: Tensor, extent: float, generator: torch.Generator
+    settings: ReflectionSettings, points: Tensor, extent: float, generator: torch.Generator, color: Tensor | None = None
 ) -> Surfels:
-    """The initial reflection set: stratified random surfels of random colour in its box (methods.md 6.1).
+    """The initial reflection set: stratified random surfels in its box (methods.md 6.1).
 
-    Each of the ``cells``^3 cells of :func:`reflection_box` gets ``per_cell`` points.
+    Each of the ``cells``^3 cells of :func:`reflection_box` gets ``per_cell`` points, all of ``color`` (3,), if it is
+    given, else of random colours.
     """
     box = reflection_box(settings, points, extent)
-    return stratified_surfels(box, settings.cells, settings.per_cell, settings.init, generator)
+    return stratified_surfels(box, settings.cells, settings.per_cell, settings.init, generator, color)
+
+
+def scene_color(kind: str, images: Iterable[Tensor]) -> Tensor | None:
+    """(3,) a colour of the training images (3, H, W): their "mean", or what a tenth of their pixels exceed ("bright").
+
+    None for the other choices of ``reflection.init_color`` and ``reflection.background``.
+    """
+    if kind not in ("mean", "bright"):
+        return None
+    pixels = torch.cat([image.flatten(1)[:, ::PIXEL_STRIDE] for image in images], dim=1)
+    return pixels.mean(dim=1) if kind == "mean" else pixels.sort(dim=1).values[:, int(0.9 * pixels.shape[1])]

@@ -39,7 +39,7 @@ from rtgs.methods.mirror import (
     surface_pixels,
 )
 from rtgs.methods.propagation import propagate_normals, reset_specular
-from rtgs.methods.reflection_set import ReflectionSet, reflection_surfels
+from rtgs.methods.reflection_set import ReflectionSet, reflection_surfels, scene_color
 from rtgs.methods.surfel_base import SurfelMethod
 from rtgs.methods.traced_pixels import TracedPixels, choose_pixels
 from rtgs.render.buffers import RasterBuffers, TraceOptions
@@ -80,6 +80,7 @@ class ReflectiveMethod(SurfelMethod):
         self.perceptual = self._find_perceptual()
         self._points = scene.points
         self._views = scene.train
+        self._sky = scene_color(settings.reflection.background, (view.image for view in scene.train))
 
     @staticmethod
     def declare_stages(settings: MethodSettings, schedule: ScheduleSettings) -> tuple[Stage, ...]:
@@ -100,7 +101,9 @@ class ReflectiveMethod(SurfelMethod):
 
     def _add_reflection(self) -> tuple[StepEvent, ...]:
         self.base.adopt(with_materials(self.base.surfels, self.settings.materials))  # type: ignore[arg-type]
-        surfels = reflection_surfels(self.settings.reflection, self._points, self.extent, self.generator)
+        settings = self.settings.reflection
+        color = scene_color(settings.init_color, (view.image for view in self._views))
+        surfels = reflection_surfels(settings, self._points, self.extent, self.generator, color)
         self.reflection = self._new_set(surfels)
         return (StepEvent("begin", "reflection", f"{len(self.reflection)} surfels in the box"),)
 
@@ -185,7 +188,8 @@ class ReflectiveMethod(SurfelMethod):
             origins, directions = (rows.index_select(0, chosen.shared.own) for rows in (origins, directions))
         traced = self.reflection.trace(origins, directions, self._trace_options(step, watched), watched=watched)
         assert traced.colors is not None
-        color = (traced.colors if chosen.shared is None else traced.colors.index_select(0, chosen.shared.ray)).T
+        colors = traced.colors if self._sky is None else traced.colors + (1 - traced.alpha)[:, None] * self._sky
+        color = (colors if chosen.shared is None else colors.index_select(0, chosen.shared.ray)).T
         reflection, transmission = self._weights(
             mirrored, pixels, None if glass is None else glass.inside[chosen.index]
         )

@@ -219,6 +219,10 @@ class ReflectionSettings:
     # EnvGS's boxes reach 3.8 (spheres), 2.7 (toycar), 4.2 and 1.9 (sedan) extents.
     box_reach: float = 2.0
     box_half: float = 0.0  # half side of a cube around the origin; 0 = box of the points (EnvGS: 20 for two scenes)
+    # Colours the set starts with, and what rays see that leave it: "random", "black" (EnvGS), or of the training images
+    # the "mean" or what a tenth of the pixels exceed ("bright"). Where they are darker than a sky, k_s falls there.
+    init_color: str = "random"
+    background: str = "black"
     offset: float = 1e-4  # of the mirror ray's start, times the extent (methods.md 6.3; EnvGS 0)
     smallest_alpha: float = 1e-2  # pixels with less coverage have no surface to reflect at
     rebuild_every: int = 100  # steps between new trees; in between the tree is refitted (kernels.md)
@@ -248,6 +252,10 @@ class ReflectionSettings:
         refuse_unless(legal, "method.reflection.direction_gradient", kind, "full or last_sh")
         kind = self.sh_direction
         refuse_unless(kind in ("unit", "raw"), "method.reflection.sh_direction", kind, "unit or raw")
+        for name, first in (("init_color", "random"), ("background", "black")):
+            value = getattr(self, name)
+            legal = (first, "mean", "bright")
+            refuse_unless(value in legal, f"method.reflection.{name}", value, " or ".join(legal))
 
 
 def _transmittance_init() -> InitSettings:

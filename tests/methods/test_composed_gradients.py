@@ -19,6 +19,7 @@ from rtgs.methods.mirror import (
     specular_change,
     surface_pixels,
 )
+from rtgs.methods.reflection_set import scene_color
 from rtgs.methods.reflective import ReflectiveMethod
 from rtgs.optics.settings import OpticsSettings
 from rtgs.render import reference, reference_trace
@@ -35,7 +36,7 @@ class TwinRender:
     fragile: Tensor  # (H, W) bool: a decision lies within float32 rounding of its threshold
 
 
-def twin_render(method: ReflectiveMethod, base, reflection, camera) -> TwinRender:
+def twin_render(method: ReflectiveMethod, base, reflection, camera, images) -> TwinRender:
     """What ``method.render`` computes, from float64 copies of both sets, by the readable twins alone."""
     settings = method.settings
     surfels = activate(base, camera.center, method.sh_degree(STEP))
@@ -73,7 +74,10 @@ def twin_render(method: ReflectiveMethod, base, reflection, camera) -> TwinRende
     )
     assert traced.colors is not None
     weight = pixel_weights(mirrored.cosine, flat, settings.optics).reflection
-    change = torch.where(covered, specular_change(flat, weight * traced.colors.T, None), 0.0)
+    color = traced.colors
+    if settings.reflection.background == "mean":  # the same pixels as the method's
+        color = color + (1 - traced.alpha[:, None]) * scene_color("mean", images).double()
+    change = torch.where(covered, specular_change(flat, weight * color.T, None), 0.0)
     image = (flat.diffuse + change).reshape(3, camera.height, camera.width)
     fragile = discontinuity_mask(*shape, features, camera, options=options).flatten()
     fragile |= fragile_rays(*traced_shape, mirrored.origins, mirrored.directions, **colors, options=trace)
@@ -96,6 +100,7 @@ CASES = {
     "not normalised": (OpticsSettings(max_gain=1.0), MaterialSettings(specular=0.3, f0=0.5, normalized=False)),
     "split sum": (OpticsSettings(weight="split_sum"), MaterialSettings(specular=0.3, roughness=0.2)),
     "envgs": (OpticsSettings(weight="envgs"), MaterialSettings(specular=0.3)),
+    "background": (OpticsSettings(weight="envgs"), MaterialSettings(specular=0.3)),
 }
 
 
@@ -103,7 +108,8 @@ CASES = {
 def test_image_and_every_gradient_are_those_of_the_twins(case: str):
     made = tiny()
     optics, materials = CASES[case]
-    quiet = recipe(propagation=PropagationSettings(every=0))
+    background = "mean" if case == "background" else "black"
+    quiet = recipe(propagation=PropagationSettings(every=0), background=background)
     method = new_method(replace(quiet, optics=optics, materials=materials), made, schedule())
     method.begin(Stage("reflection", 15, 60))
     generator = torch.Generator().manual_seed(4)
@@ -114,7 +120,7 @@ def test_image_and_every_gradient_are_those_of_the_twins(case: str):
         method.base.surfels.log_scales += 0.3
     camera = made.scene.train[0].camera
     base, reflection = doubled(method.sets[0].surfels), doubled(method.sets[1].surfels)
-    twin = twin_render(method, base, reflection, camera)
+    twin = twin_render(method, base, reflection, camera, [view.image for view in made.scene.train])
     rendered = method.render(camera, STEP)
     clear = ~twin.fragile
     assert float(clear.double().mean()) > 0.3

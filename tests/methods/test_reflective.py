@@ -18,7 +18,7 @@ from safetensors.torch import load_file
 from rtgs.config import compose
 from rtgs.gaussians.materials import MATERIAL_NAMES, MaterialSurfels
 from rtgs.methods import RenderOptions, Stage
-from rtgs.methods.reflection_set import reflection_box, reflection_surfels
+from rtgs.methods.reflection_set import reflection_box, reflection_surfels, scene_color
 from rtgs.methods.reflective import ReflectiveMethod
 from rtgs.optics.microfacet import specular_weights
 from rtgs.train.checkpoint import checkpoint_path
@@ -86,6 +86,23 @@ def test_the_reflection_set_surrounds_what_the_cameras_look_at():
     means = reflection_surfels(settings, flat, 3.0, torch.Generator().manual_seed(0)).means.detach()
     assert len(means) == 54
     assert float(means[:, 2].max()) > 3
+
+
+def test_the_reflection_set_can_start_in_a_colour_of_the_training_images():
+    values = torch.linspace(0, 1, 4 * 5 * 370).reshape(4, 1, 5, 370)
+    images = [torch.cat((image, image / 2, 0 * image)) for image in values]
+    torch.testing.assert_close(scene_color("mean", images), torch.tensor([0.5, 0.25, 0]), atol=0.01, rtol=0)
+    torch.testing.assert_close(scene_color("bright", images), torch.tensor([0.9, 0.45, 0]), atol=0.01, rtol=0)
+    assert scene_color("random", images) is None
+    assert scene_color("black", images) is None
+    made = tiny()
+    method = new_method(recipe(init_color="bright"), made, schedule())
+    method.begin(Stage("reflection", 15, 60))
+    assert method.reflection is not None
+    expected = scene_color("bright", [view.image for view in made.scene.train])
+    assert expected is not None
+    found = 0.5 + 0.28209479 * method.reflection.surfels.sh_dc.detach()
+    torch.testing.assert_close(found, expected.expand_as(found), atol=1e-5, rtol=0)
 
 
 def test_rtgs_starts_as_bright_as_the_mirror_ray_from_every_angle():
