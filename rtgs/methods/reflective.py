@@ -22,7 +22,6 @@ from rtgs.methods.base import (
     LossTerms,
     RenderedView,
     RenderOptions,
-    SpecularLayers,
     Stage,
     StepEvent,
 )
@@ -38,6 +37,7 @@ from rtgs.methods.mirror import (
     specular_change,
     surface_pixels,
 )
+from rtgs.methods.pixel_maps import full_map, specular_layers, take_pixels
 from rtgs.methods.propagation import propagate_normals, reset_specular
 from rtgs.methods.reflection_set import ReflectionSet, reflection_surfels, scene_color
 from rtgs.methods.surfel_base import SurfelMethod
@@ -177,8 +177,8 @@ class ReflectiveMethod(SurfelMethod):
         flat = flat if glass is None else glass.flat
         rays = camera.rays()
         view = rays.directions.reshape(-1, 3).T
-        chosen = self._choose(flat, buffers, view, glass, training=options is None)
-        pixels = _take(flat, chosen.index)
+        chosen = self._choose(flat, buffers, view, glass, step if options is None else None)
+        pixels = take_pixels(flat, chosen.index)
         seen = view.index_select(1, chosen.index)
         mirrored = mirror_rays(pixels, rays.origin, seen, self.settings.reflection.sh_direction)
         ahead = self.reflection.density.needs_signal and densify_ahead(self.plan.reflection, step)
@@ -203,12 +203,12 @@ class ReflectiveMethod(SurfelMethod):
         specular = flat.specular.reshape(shape[1:])
         layers = None
         if options is not None and options.layers:
-            layers = _layers(flat, chosen, pixels.specular * reflection * color, color, shape)
+            layers = specular_layers(flat, chosen, pixels.specular * reflection * color, color, shape)
         if glass is None or passed is None:
             return RenderedView(camera, image, buffers, layers, specular)
         if layers is not None:
             through = pixels.specular * transmission * passed.color
-            both = (_full(values.detach(), chosen, shape) for values in (through, passed.color))
+            both = (full_map(values.detach(), chosen, shape) for values in (through, passed.color))
             layers = replace(layers, **dict(zip(("transmission", "transmitted_color"), both, strict=True)))
         seen_through = glass.inside.reshape(shape[1:])
         return RenderedView(camera, image, buffers, layers, specular, passed.first_bounce, seen_through)
@@ -237,13 +237,16 @@ class ReflectiveMethod(SurfelMethod):
 
     @torch.no_grad()
     def _choose(
-        self, flat: SurfacePixels, buffers: RasterBuffers, view: Tensor, glass: GlassPixels | None, *, training: bool
+        self, flat: SurfacePixels, buffers: RasterBuffers, view: Tensor, glass: GlassPixels | None, step: int | None
     ) -> TracedPixels:
-        settings = self.settings.reflection
+        """``step`` of training, or None."""
+        settings, traced = self.settings.reflection, self.settings.reflection.traced
+        if step is None or step < self.plan.judged:  # k_s has to tell the mirrors from the rest first
+            traced = replace(traced, shared_below=0.0)
         surface = (buffers.alpha.flatten() > settings.smallest_alpha) & (flat.depth > 0)
         surface &= flat.normal.square().sum(0) > SHORTEST_NORMAL**2
         showing = None
-        if settings.traced.threshold > 0 or (training and settings.traced.shared_below > 0):
+        if traced.threshold > 0 or traced.shared_below > 0:
             showing = flat.specular
             if not self.settings.optics.at_most_one:
                 unit = flat.normal / flat.normal.square().sum(0).sqrt().clamp_min(SHORTEST_NORMAL)
@@ -254,8 +257,8 @@ class ReflectiveMethod(SurfelMethod):
             showing = (showing if glass is None else showing.masked_fill(glass.inside, torch.inf)).reshape(
                 buffers.alpha.shape
             )
-        generator = self.generator if training else None
-        return choose_pixels(surface.reshape(buffers.alpha.shape), showing, settings.traced, generator)
+        generator = None if step is None else self.generator
+        return choose_pixels(surface.reshape(buffers.alpha.shape), showing, traced, generator)
 
     def _trace_options(self, step: int, watched: bool) -> TraceOptions:
         settings = self.settings.reflection
@@ -372,29 +375,3 @@ class ReflectiveMethod(SurfelMethod):
         super().load(state)
         if "matte" in state:
             self._tell_matte(MatteEvidence.of(state["matte"]))
-
-
-def _full(values: Tensor, chosen: TracedPixels, shape) -> Tensor:
-    """(3, P) values of the traced pixels as a picture, 0 elsewhere."""
-    return torch.zeros(3, shape[1] * shape[2]).index_copy(1, chosen.index, values).reshape(shape)
-
-
-def _take(pixels: SurfacePixels, index: Tensor) -> SurfacePixels:
-    """The pixels of an index (P,)."""
-    rows = (getattr(pixels, name) for name in ("diffuse", "specular", "roughness", "f0", "normal", "depth"))
-    return SurfacePixels(*(row.index_select(-1, index) for row in rows))
-
-
-def _layers(flat: SurfacePixels, chosen: TracedPixels, reflection: Tensor, color: Tensor, shape) -> SpecularLayers:
-    """The maps of a view from what was traced."""
-    traced = torch.zeros(shape[1] * shape[2], dtype=torch.bool)
-    traced[chosen.index] = True
-    return SpecularLayers(
-        diffuse=flat.diffuse.reshape(shape),
-        reflection=_full(reflection.detach(), chosen, shape),
-        reflected_color=_full(color.detach(), chosen, shape),
-        specular=flat.specular.reshape(shape[1:]),
-        roughness=flat.roughness.reshape(shape[1:]),
-        f0=flat.f0.reshape(*flat.f0.shape[:-1], *shape[1:]),
-        traced=traced.reshape(shape[1:]),
-    )

@@ -73,8 +73,8 @@ class TracedShareSettings:
     threshold: float = 0.0  # k_s * max(w_r, 1) below which a pixel counts as one of the rest; 0 = trace all, as EnvGS
     share: float = 0.25  # of the rest, in training: whole tiles, drawn afresh each step, gradients times 1 / share
     tile: int = 8  # side of these tiles, pixels
-    # In training, pixels of a 2x2 block below this k_s * max(w_r, 1) show the colour of one mirror ray, of another of
-    # them each step: an error of at most so much of what their rays differ (docs/reflection.md). 0 = never, as EnvGS
+    # In training after matte.probation, the pixels of a 2x2 block below this k_s * max(w_r, 1) show the colour of one
+    # mirror ray, each step of another of them: an error of at most so much of what their rays differ. 0 = never (EnvGS)
     shared_below: float = 0.0
 
     def __post_init__(self) -> None:
