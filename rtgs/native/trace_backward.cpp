@@ -41,6 +41,9 @@ class PacketBackward {
   vfloat sum_column(const SurfelHits& hits, const float* column, const uint32_t (*masks)[kMostColumns]) const;
   void sum_hits(const SurfelHits& hits, float* out, bool adds) const;
   void add_direction(const SurfelHits& hits, uint32_t lanes, int64_t id);
+  bool sum_both(const SurfelHits& hits, int64_t id, float* out, bool adds);
+  template <int K, bool kClamped>
+  void sum_both_of(const SurfelHits& hits, int64_t id, float* out, bool adds);
   void write_rays();
 
   const float* record(int32_t slot) const { return args_.records + int64_t(kTraceFields) * slot; }
@@ -283,6 +286,51 @@ inline void PacketBackward::add_direction(const SurfelHits& hits, uint32_t lanes
   }
 }
 
+// sum_hits and add_direction in one pass over the hits, for colours alone and K registers of coefficients.
+template <int K, bool kClamped>
+inline void PacketBackward::sum_both_of(const SurfelHits& hits, int64_t id, float* out, bool adds) {
+  const float* values = args_.surfels.sh_rest + int64_t(3) * args_.surfels.rest * id;
+  const int used = 3 * rest_count(args_.surfels.degree);
+  vfloat value[K], sums[K], channels = broadcast(0.f);
+  for (int k = 0; k < K; ++k) {
+    value[k] = load_first(values + k * kLanes, used - k * kLanes < kLanes ? used - k * kLanes : kLanes);
+    sums[k] = broadcast(0.f);
+  }
+  for (uint32_t left = hits.lanes; left; left &= left - 1) {
+    const int lane = __builtin_ctz(left);
+    const RayRow& row = ray_rows_[lane];
+    const vfloat w = broadcast(hits.weights[lane]);
+    const auto kept = [&](const float* from, const uint32_t* mask) {
+      const vfloat v = load(from);
+      return kClamped ? (vfloat)((vint)v & load_int((const int32_t*)mask)) : v;
+    };
+    const int clamped = kClamped ? hits.clamped_colors[lane] : 0;
+    channels = fma(w, kept(row.channels, masks_.channels[clamped]), channels);
+#pragma GCC unroll 6
+    for (int k = 0; k < K; ++k) {
+      const uint32_t* mask = masks_.coefficients[clamped] + k * kLanes;
+      float* to = to_basis_[lane] + k * kLanes;
+      sums[k] = fma(w, kept(row.coefficients + k * kLanes, mask), sums[k]);
+      store(to, fma(w * kept(row.pattern + k * kLanes, mask), value[k], load(to)));
+    }
+  }
+  put(out + kTraceGradChannels, channels, adds);
+  for (int k = 0; k < K; ++k) put(out + kTraceGradChannels + (k + 1) * kLanes, sums[k], adds);
+}
+inline bool PacketBackward::sum_both(const SurfelHits& hits, int64_t id, float* out, bool adds) {
+  if (layout_.channels != kLanes) return false;
+  switch (layout_.coefficients / kLanes) {
+#define RTGS_SUM_BOTH(K)                                        \
+  case K:                                                       \
+    if (hits.clamped) sum_both_of<K, true>(hits, id, out, adds); \
+    else sum_both_of<K, false>(hits, id, out, adds);            \
+    return true;
+    RTGS_SUM_BOTH(1) RTGS_SUM_BOTH(2) RTGS_SUM_BOTH(3) RTGS_SUM_BOTH(6)
+#undef RTGS_SUM_BOTH
+    default: return false;
+  }
+}
+
 void PacketBackward::add_surfels() {
   for (int k = 0; k < tape_.surfels; ++k) {
     if (args_.surfel_gradients && k + kTracePrefetch < tape_.surfels) {
@@ -302,6 +350,7 @@ void PacketBackward::add_surfels() {
       bool adds;
       float* out = destination(slot, adds);
       for (int c = 0; c < kTraceGradChannels; c += kLanes) put(out + c, settled(sums_of<>(sums + c)), adds);
+      if (args_.ray_gradients && !args_.options.last_sh && sum_both(hits, tape_.ids[k], out, adds)) continue;
       sum_hits(hits, out, adds);
     }
     if (args_.ray_gradients && layout_.coefficients) {

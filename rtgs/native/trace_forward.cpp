@@ -54,6 +54,7 @@ class PacketTracer {
   vfloat t_max_, transmittance_ = broadcast(1.f), depth_ = broadcast(0.f);
   vmask active_;
   vint waiting_ = broadcast_int(0);  // hits per lane
+  int most_waiting_ = 0;             // no lane has more
   int pending_ = 0, places_ = 0, rows_ = 0, met_ = 0, sort_at_ = kSortAt;
   int64_t hits_ = 0;
 };
@@ -83,27 +84,38 @@ inline void PacketTracer::visit_node(int32_t index) {
 
 inline void PacketTracer::visit_leaf(int32_t child) {
   const int32_t first = leaf_first(child), count = leaf_count(child);
-  work_.t.reserve((places_ + count) * int64_t(kLanes));
-  work_.exponents.reserve((places_ + count) * int64_t(kLanes));
-  work_.weights.reserve((places_ + count) * int64_t(kLanes));
+  const int64_t floats = (places_ + count) * int64_t(kLanes);
+  work_.t.reserve(floats);
+  work_.exponents.reserve(floats);
+  work_.weights.reserve(floats);
   work_.slots.reserve(places_ + count);
-  work_.columns.reserve((int64_t(largest(to_float(waiting_))) + count + 1) * kLanes);
-  const vint lane = truncate(lane_numbers());
-  for (int32_t slot = first; slot < first + count; ++slot) {
-    const float* s = record(slot);
+  work_.columns.reserve((most_waiting_ + count + 1) * int64_t(kLanes));
+  // Locals: a store through a vector may alias any member.
+  float *t = work_.t.data, *exponents = work_.exponents.data, *weights = work_.weights.data;
+  int32_t *slots = work_.slots.data, *columns = work_.columns.data;
+  const float* s = record(first);
+  const vfloat t_max = t_max_;
+  uint32_t lanes[kMostPerLeaf];
+  int found = 0;  // without a branch: a wrong guess costs as much as several tests
+  for (int32_t slot = first; slot < first + count; ++slot, s += kTraceFields) {
     const PlaneHit hit = plane_hit(s, rays_);
-    const vmask counts = le(hit.rho, broadcast(s[kTraceReach])) & gt(hit.t, rays_.t_min) & lt(hit.t, t_max_) &
+    const vmask counts = le(hit.rho, broadcast(s[kTraceReach])) & gt(hit.t, rays_.t_min) & lt(hit.t, t_max) &
                          ge(abs(hit.cosine), rays_.least_cosine);
-    if (!any(counts)) continue;
-    const int64_t at = int64_t(places_) * kLanes;
-    store(work_.t.data + at, hit.t);
-    store(work_.exponents.data + at, response_exponent(s, hit.rho));
-    store(work_.weights.data + at, broadcast(0.f));
-    work_.slots[places_] = slot;
-    scatter_int(work_.columns.data, waiting_ * kLanes + lane, broadcast_int(places_), counts);
-    waiting_ += select_int(counts, broadcast_int(1), broadcast_int(0));
-    ++places_;
+    const int64_t at = int64_t(places_ + found) * kLanes;
+    store(t + at, hit.t);
+    store(exponents + at, response_exponent(s, hit.rho));
+    slots[places_ + found] = slot;
+    lanes[found] = mask_bits(counts);
+    found += lanes[found] != 0;
   }
+  const vint lane = truncate(lane_numbers());
+  for (int k = 0; k < found; ++k) {
+    const vmask counts = lanes_from_bits(lanes[k]);
+    store(weights + int64_t(places_) * kLanes, broadcast(0.f));
+    scatter_int(columns, waiting_ * kLanes + lane, broadcast_int(places_++), counts);
+    waiting_ += select_int(counts, broadcast_int(1), broadcast_int(0));
+  }
+  most_waiting_ += found;
 }
 
 void PacketTracer::run() {
@@ -112,7 +124,7 @@ void PacketTracer::run() {
   pending_ = 1;
   while (pending_) {
     const PendingChild next = work_.pending[--pending_];
-    if (any(gt_int(waiting_, broadcast_int(sort_at_ - 1)))) {
+    if (most_waiting_ >= sort_at_ && any(gt_int(waiting_, broadcast_int(sort_at_ - 1)))) {
       settle(next.nearest);
       if (!any(active_)) break;
     }
@@ -191,6 +203,7 @@ inline void PacketTracer::keep_rest(vint settled, int rows) {
   const vint lane = truncate(lane_numbers());
   waiting_ = select_int(active_, waiting_ - settled, broadcast_int(0));
   const int left = int(largest(to_float(waiting_)));
+  most_waiting_ = left;
   for (int row = 0; row < left; ++row) {
     const vint from = min_int(settled + row, broadcast_int(rows - 1));
     store_ints(work_.columns.data + row * kLanes, gather_int(work_.sorted_places.data, from * kLanes + lane));
