@@ -10,7 +10,7 @@ namespace {
 
 constexpr int kAxes = 5;            // octahedral direction (2), origin (3)
 constexpr int kKeyBits = 30, kMostAxisBits = 15;
-constexpr float kOriginWeight = 1 / 1.5f;  // one unit of octahedral direction, some 2.5 radians, against one scene size
+constexpr float kOriginWeight = 1 / 0.7f;  // one unit of octahedral direction, some 2.5 radians, against one scene size
 constexpr int kSampleStride = 16;   // of rays, for the guess how close sorted rays would be
 constexpr float kWorthSorting = 1.4f;  // rays that come this much wider than sorted ones would be are sorted
 
