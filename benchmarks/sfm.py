@@ -1,8 +1,9 @@
 """Poses from images alone, beside the poses a capture brings.
 
 ``python -m benchmarks.sfm [SCENE ...] [--photos N] [--threads 2]``: the photos of each real set in
-``$RTGS_SHARED/data`` are copied without their model, poses are looked for, and compared with the given ones after
-alignment. Each set in a process of its own, so that the peak of memory is its own. The last line is a JSON object.
+``$RTGS_SHARED/data`` are taken without their model, poses are looked for, and compared with the given ones after
+alignment. Each set in a process of its own, so that the peak of memory is its own; ``--keep FOLDER`` keeps each row,
+and what is kept is not measured again. The last line is a JSON object.
 Columns: photos the given model holds, of which found; degrees and per mille of the cameras' extent (median, largest);
 focal length; reprojection error; seconds and CPU seconds per photo; peak resident memory, and how much of it was there
 before the first photo (imports).
@@ -120,12 +121,30 @@ def table(rows: list[Row]) -> str:
     return "\n".join(lines)
 
 
+def measured(capture: Path, photos: int | None, threads: int, keep: Path | None) -> str:
+    """The row of one set as JSON, from ``keep`` or by a process of its own; empty when that fails."""
+    kept = keep / f"{capture.name}-{photos or 'all'}-{threads}.json" if keep else None
+    if kept is not None and kept.is_file():
+        return kept.read_text(encoding="utf-8")
+    words = ["--one", str(capture), "--threads", str(threads)]
+    words += ["--photos", str(photos)] if photos else []
+    result = subprocess.run([sys.executable, "-m", "benchmarks.sfm", *words], stdout=subprocess.PIPE, check=False)
+    if result.returncode:
+        return ""
+    text = result.stdout.decode().splitlines()[-1]
+    if kept is not None:
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        kept.write_text(text + "\n", encoding="utf-8")
+    return text
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Measure every set in a process of its own; print the table and the JSON."""
     parser = argparse.ArgumentParser("python -m benchmarks.sfm", description=__doc__)
     parser.add_argument("scenes", nargs="*", help=f"names in $RTGS_SHARED/data (default: {' '.join(SCENES)})")
     parser.add_argument("--photos", type=int, help="only the first so many photos of each set")
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--keep", type=Path, help="folder of rows measured before, which are not measured again")
     parser.add_argument("--one", metavar="FOLDER", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     if options.one:
@@ -137,13 +156,11 @@ def main(arguments: list[str] | None = None) -> None:
         if not (data / name).is_dir():
             print(f"{name}: not in {data}", file=sys.stderr)
             continue
-        words = ["--one", str(data / name), "--threads", str(options.threads)]
-        words += ["--photos", str(options.photos)] if options.photos else []
-        result = subprocess.run([sys.executable, "-m", "benchmarks.sfm", *words], stdout=subprocess.PIPE, check=False)
-        if result.returncode:
+        text = measured(data / name, options.photos, options.threads, options.keep)
+        if not text:
             print(f"{name}: failed, see above", file=sys.stderr)
             continue
-        values = json.loads(result.stdout.splitlines()[-1])
+        values = json.loads(text)
         rows.append(Row(**{**values, "missing": tuple(values["missing"])}))
         print(table(rows[-1:]).splitlines()[-1], file=sys.stderr, flush=True)
     print(table(rows))

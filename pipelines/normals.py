@@ -54,11 +54,12 @@ def normals(params: NormalParams, context: StepContext) -> None:
 
 STEP = StepKind(
     "normals",
-    1,
+    2,
     normals,
     helpers=(
         "rtgs.prepare.normals",
         "rtgs.prepare.normal_maps",
+        "rtgs.prepare.normal_tiles",
         "rtgs.prepare.adapters",
         "rtgs.prepare.onnx",
         "rtgs.scenes.undistort",

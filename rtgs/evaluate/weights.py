@@ -17,6 +17,8 @@ from torch import Tensor
 
 from rtgs.errors import RtgsError
 
+SUMS_FILE = "SHA256SUMS"
+
 
 class MissingWeights(RtgsError):
     """A pretrained file is not on this machine. The message names the places searched and where to get it."""
@@ -118,19 +120,55 @@ def _readable(folder: Path) -> str:
 
 
 def verify_weights(file: PretrainedFile, path: Path) -> None:
-    """Compare the SHA-256 of ``path`` with the registered one, where one is registered.
+    """Compare the SHA-256 of ``path`` with the registered one, and with that in ``SHA256SUMS``; nothing where there is
+    neither.
 
     Raises:
         WrongWeights: they differ: another model, or a download cut short.
     """
-    if not file.sha256:
+    if not (file.sha256 or noted_digest(path)):
         return
     digest = sha256_of(path)
-    if digest != file.sha256:
+    check_noted_digest(path, digest)
+    if file.sha256 and digest != file.sha256:
         raise WrongWeights(
             f"{path} is not {file.filename}: SHA-256 {digest[:16]}..., expected {file.sha256[:16]}... "
             f"({path.stat().st_size / 2**20:.1f} MB, expected about {file.megabytes:g} MB). "
             f"Fetch it again from {file.source}"
+        )
+
+
+def noted_digest(path: Path) -> str:
+    """The SHA-256 a person noted for a file, as ``sha256sum`` writes it, in the ``SHA256SUMS`` of its folder or of the
+    folder above; empty: none.
+
+    Raises:
+        WrongWeights: that file is no list of digests.
+    """
+    for folder in path.parents[:2]:
+        listed = folder / SUMS_FILE
+        if not listed.is_file():
+            continue
+        for line in listed.read_text(encoding="utf-8").splitlines():
+            digest, _, name = line.partition(" ")
+            if line.strip() and not (len(digest) == 64 and name.strip()):
+                raise WrongWeights(f"{listed}: {line[:40]!r} is no line of sha256sum (digest, two blanks, file name)")
+            if name.strip().removeprefix("*").removeprefix("./") == path.relative_to(folder).as_posix():
+                return digest.lower()
+    return ""
+
+
+def check_noted_digest(path: Path, digest: str) -> None:
+    """Compare the SHA-256 of a file with the noted one, if there is one.
+
+    Raises:
+        WrongWeights: they differ.
+    """
+    noted = noted_digest(path)
+    if noted and noted != digest:
+        raise WrongWeights(
+            f"{path} has SHA-256 {digest[:16]}..., {SUMS_FILE} beside it says {noted[:16]}...: it is another file, or "
+            f"a copy cut short; copy it again, or correct {SUMS_FILE}"
         )
 
 

@@ -32,15 +32,17 @@ class NormalAdapter:
     """The output holds (n + 1) / 2 in 0..1 instead of n."""
     mean: tuple[float, ...] = (0.0, 0.0, 0.0)
     std: tuple[float, ...] = (1.0, 1.0, 1.0)
-    """The network sees (picture - mean) / std, the picture in 0..1."""
+    """The network sees (picture - mean) / std, the picture in 0..1: a std of 1/255 gives it 0..255."""
     channels_last: bool = False
     """(1, H, W, 3) instead of (1, 3, H, W), input and output."""
     fit: str = "multiple"
     """``multiple``: shrink to ``size`` on the long side and round both sides to a multiple of ``multiple``;
-    ``stretch``: to size x size, aspect lost; ``pad``: shrink into (height, width) = ``box`` and pad with the mean."""
+    ``stretch``: to size x size, aspect lost; ``pad``: shrink into (height, width) = ``box`` and pad with ``fill``."""
     size: int = 768
     multiple: int = 32
     box: tuple[int, ...] = (616, 1064)
+    fill: tuple[float, ...] = IMAGENET_MEAN
+    """Colour of the padding, 0..1."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "axes", tuple(self.axes))
@@ -60,13 +62,17 @@ class NormalAdapter:
 
 
 ADAPTERS: dict[str, NormalAdapter] = {
-    # x left, y up, z at the camera (Stable-X/StableNormal issue 18).
+    # Axes as the authors say: x left, y up, z at the camera (Stable-X/StableNormal issue 18). Range and sizes assumed.
     "stablenormal": NormalAdapter(axes=("-x", "-y", "-z"), mean=(0.5,) * 3, std=(0.5,) * 3, multiple=64),
-    # x right, y down, z forward, but a wall that faces the camera is (0, 0, 1): all three turned (DSINE issue 8).
+    # Axes as the author says: x right, y down, z forward, but outward, a wall that faces the camera is (0, 0, 1): all
+    # three turned (baegwangbin/DSINE issues 8 and 12).
     "dsine": NormalAdapter(axes=("-x", "-y", "-z"), mean=IMAGENET_MEAN, std=IMAGENET_STD, intrinsics="intrins"),
-    # (n + 1) / 2 in the camera's x right, y down, z forward (as MonoSDF turns them by the camera's rotation).
+    # (n + 1) / 2, x right, y down, as the author says (EPFL-VILAB/omnidata issue 13). Of z he says "at the camera", yet
+    # the network gives -0.81 for a wall ahead (measured in maturk/dn-splatter issue 9) and MonoSDF uses it unturned.
     "omnidata": NormalAdapter(unit_range=True, fit="stretch", size=384),
-    # ImageNet's mean and deviation, 616 x 1064 padded (hubconf.py); four channels, the fourth is confidence.
-    "metric3d": NormalAdapter(output="predicted_normal", mean=IMAGENET_MEAN, std=IMAGENET_STD, fit="pad"),
+    # The published export normalises inside, wants 0..255 and has its confidence apart (YvanYin/Metric3D issue 117).
+    # Order x, y, z and 255 minus the usual colours, as the authors say (issue 70), so z forward; x right, y down as in
+    # facebookresearch/sapiens issue 50.
+    "metric3d": NormalAdapter(input="pixel_values", output="predicted_normal", std=(1 / 255,) * 3, fit="pad"),
 }
 """By name of the registry. A network of another family: set every field of ``normals.adapter``."""

@@ -24,7 +24,7 @@ from rtgs.prepare.masks_plane import Pane, fit_pane, in_polygon, seen_from
 from rtgs.prepare.masks_segment import Segmenter
 from rtgs.prepare.masks_settings import MaskSettings
 from rtgs.prepare.onnx import Network
-from rtgs.prepare.weights import REGISTRY, find_weights
+from rtgs.prepare.weights import REGISTRY, check_noted_digest, find_weights
 from rtgs.scenes.canonical import content_hash
 from rtgs.scenes.capture import Capture, CaptureView, list_some
 from rtgs.scenes.images import image_size, nearest_resize, read_mask, read_photo, same_aspect
@@ -151,8 +151,7 @@ def find_networks(settings: MaskSettings) -> NetworkFiles:
     """The files in force.
 
     Raises:
-        MissingWeights: one is not there; says where to get it.
-        PrepareError: a file that the settings name is not there.
+        MissingWeights, PrepareError: one is not there; says where to get it, or which setting names it.
     """
     detector, segmenter = settings.detector, settings.segmenter
     found = _find("masks.detector.file", detector.file, "grounding_dino")
@@ -175,7 +174,11 @@ def _find(key: str, named: str, registered: str) -> Path:
 
 
 def file_digest(path: Path) -> str:
-    """SHA-256 of a network's file and of the weights in files of their own beside it."""
+    """SHA-256 of a network's file and of the weights in files of their own beside it.
+
+    Raises:
+        WrongWeights: one that ``SHA256SUMS`` states is another.
+    """
     files = [path]
     if path.suffix == ".onnx":
         files += sorted(other for other in path.parent.iterdir() if other.name.endswith((".onnx_data", ".onnx.data")))
@@ -183,6 +186,7 @@ def file_digest(path: Path) -> str:
     for file in files:
         state = file.stat()
         digests.append(content_hash(str(file), state.st_size, state.st_mtime_ns))
+        check_noted_digest(file, digests[-1])
     return digests[0] if len(digests) == 1 else hashlib.sha256("".join(digests).encode()).hexdigest()
 
 

@@ -18,6 +18,8 @@ from rtgs.prepare.onnx import Network
 from rtgs.scenes.images import unit_or_zero
 from rtgs.scenes.undistort import Lens, project
 
+_ENOUGH = 50  # points on flat surfaces that a verdict on the axes rests on at the least
+
 
 @dataclass(frozen=True)
 class _Fitted:
@@ -81,7 +83,7 @@ def _fit(photo: np.ndarray, adapter: NormalAdapter) -> _Fitted:
     if adapter.fit != "pad":
         return _Fitted(pixels, slice(0, rows), slice(0, columns))
     box = np.empty((*adapter.box, 3), dtype=np.float32)
-    box[:] = adapter.mean
+    box[:] = adapter.fill
     top, left = (adapter.box[0] - rows) // 2, (adapter.box[1] - columns) // 2
     box[top : top + rows, left : left + columns] = pixels
     return _Fitted(box, slice(top, top + rows), slice(left, left + columns))
@@ -178,13 +180,14 @@ class AxisVerdict:
 
     @property
     def flipped(self) -> bool:
-        """True when other axes agree clearly better."""
-        return self.best_agreement > 0.35 and self.best_agreement - self.agreement > 0.15
+        """True when other axes agree clearly better, and there are enough samples to say so."""
+        clear = self.best_agreement > 0.35 and self.best_agreement - self.agreement > 0.15
+        return clear and self.samples >= _ENOUGH
 
     @property
     def message(self) -> str:
         """In words."""
-        if self.samples < 50:
+        if self.samples < _ENOUGH:
             return f"normals not checked against the points: only {self.samples} points lie on flat enough surfaces"
         text = (
             f"predicted normals and the surfaces of {self.samples} points agree with a mean cosine of "
@@ -192,29 +195,35 @@ class AxisVerdict:
         )
         if self.flipped:
             return (
-                f"{text}. With axes {list(self.best)} it would be {self.best_agreement:.2f}: an axis of the network is "
+                f"{text}. With axes {list(self.best)} it would be {self.best_agreement:.2f}: the network's axes are "
                 f"declared wrongly; set normals.axes=[{','.join(self.best)}]"
             )
         return text
 
 
 def judge_axes(predicted: np.ndarray, samples: SurfaceSample, adapter: NormalAdapter) -> AxisVerdict:
-    """Compare predicted canonical normals (N, 3) at the samples with the estimated ones, under every sign of axes."""
+    """Compare predicted canonical normals (N, 3) at the samples with the estimated ones, under every order and every
+    sign of the axes (48; a mirrored frame is as likely as a turned one)."""
     known = np.linalg.norm(predicted, axis=1) > 0.5
     predicted, estimated, rays = predicted[known], samples.normals[known], samples.rays[known]
     if not len(predicted):
         return AxisVerdict(0, 0.0, adapter.axes, 0.0, 0.0)
-    products = (predicted * estimated).mean(axis=0)
-    best, best_score = (1, 1, 1), float(products.sum())
-    agreement = best_score
-    for signs in itertools.product((1, -1), repeat=3):
-        score = float(products @ signs)
-        if score > best_score + 1e-9:
-            best, best_score = signs, score
-    flips = dict(zip("xyz", best))
-    axes = tuple(axis if flips[axis[1]] == 1 else ("-" if axis[0] == "+" else "+") + axis[1] for axis in adapter.axes)
+    products = predicted.T @ estimated / len(predicted)  # [i, j]: mean of predicted axis i times estimated axis j
+    agreement = best_score = float(np.trace(products))
+    truly = ("+x", "+y", "+z")  # what the predicted x, y, z are
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1, -1), repeat=3):
+            score = float(sum(sign * products[i, j] for i, (j, sign) in enumerate(zip(order, signs))))
+            if score > best_score + 1e-9:
+                truly = tuple(("+" if sign == 1 else "-") + "xyz"[j] for j, sign in zip(order, signs))
+                best_score = score
     facing = float(((predicted * rays).sum(axis=1) < 0).mean())
+    axes = tuple(_turned(truly["xyz".index(axis[1])], axis[0]) for axis in adapter.axes)
     return AxisVerdict(len(predicted), agreement, axes, best_score, facing)
+
+
+def _turned(axis: str, sign: str) -> str:
+    return ("+" if axis[0] == sign else "-") + axis[1]
 
 
 def joined(parts: list[SurfaceSample]) -> SurfaceSample:

@@ -18,15 +18,15 @@ from rtgs.prepare.normal_maps import (
     SurfaceSample,
     joined,
     judge_axes,
-    predict_normals,
     sample_surface,
     save_normals,
     surface_normals,
 )
+from rtgs.prepare.normal_tiles import Tiling, predict_tiled
 from rtgs.prepare.onnx import Network
 from rtgs.prepare.progress import Say, Ticker
 from rtgs.prepare.settings import NormalSettings
-from rtgs.prepare.weights import REGISTRY, PretrainedFile, find_weights
+from rtgs.prepare.weights import REGISTRY, PretrainedFile, check_noted_digest, find_weights
 from rtgs.scenes.canonical import content_hash
 from rtgs.scenes.capture import Capture, CaptureView
 from rtgs.scenes.images import area_resize, read_photo
@@ -58,6 +58,7 @@ def find_network(settings: NormalSettings) -> tuple[Path, str]:
     Raises:
         MissingWeights: it is not there; says where to get it.
         PrepareError: it has another digest than ``normals.sha256``.
+        WrongWeights: it has another digest than ``SHA256SUMS`` beside it states.
     """
     if settings.file:
         path = Path(settings.file).expanduser()
@@ -68,6 +69,7 @@ def find_network(settings: NormalSettings) -> tuple[Path, str]:
         path = find_weights(file)
     state = path.stat()
     digest = content_hash(str(path), state.st_size, state.st_mtime_ns)
+    check_noted_digest(path, digest)
     if settings.sha256 and digest != settings.sha256.lower():
         raise PrepareError(f"{path} has SHA-256 {digest}, normals.sha256 is {settings.sha256}: it is another file")
     return path, digest
@@ -102,7 +104,7 @@ def make_normals(
         kept = cache / f"{_key(view, digest, adapter, settings, scene)}.npy"
         cached += kept.is_file()
         if not kept.is_file():
-            save_normals(_predict(view, network, adapter, settings.max_side, scene), kept)
+            save_normals(_predict(view, network, adapter, settings, scene), kept)
         shutil.copyfile(kept, place)
         if surfaces is not None and capture.points is not None:
             normals = np.load(kept).astype(np.float32)
@@ -127,6 +129,7 @@ def _key(view: CaptureView, digest: str, adapter: NormalAdapter, settings: Norma
         "network": digest,
         "adapter": adapter,
         "max_side": settings.max_side,
+        "tiles": (settings.tile, settings.tile_overlap) if settings.tile else (),
         "photo": content_hash(str(view.image), state.st_size, state.st_mtime_ns),
         "background": scene.background,
         "lens": view.lens,
@@ -135,16 +138,17 @@ def _key(view: CaptureView, digest: str, adapter: NormalAdapter, settings: Norma
 
 
 def _predict(
-    view: CaptureView, network: Network, adapter: NormalAdapter, max_side: int, scene: SceneSettings
+    view: CaptureView, network: Network, adapter: NormalAdapter, settings: NormalSettings, scene: SceneSettings
 ) -> np.ndarray:
     """Canonical normals of one photo, distorted as it is (the import undistorts them), at most ``max_side`` long."""
     assert view.lens is not None, "photos without a lens are refused when the capture is read"
     photo = read_photo(view.image, scene.background, (view.lens.width, view.lens.height))
-    width, height = _small(photo.shape[1], photo.shape[0], max_side)
+    width, height = _small(photo.shape[1], photo.shape[0], settings.max_side)
     lens = view.lens.fitted(width, height, view.name)
     fx, fy, cx, cy = lens.pinhole().params if lens.is_pinhole else _pinhole_part(lens)
     calibration = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    return predict_normals(network, adapter, area_resize(photo, width, height), calibration)
+    tiling = Tiling(settings.tile, settings.tile_overlap)
+    return predict_tiled(network, adapter, area_resize(photo, width, height), calibration, tiling)
 
 
 def _pinhole_part(lens: Lens) -> tuple[float, ...]:

@@ -103,6 +103,8 @@ class MappingSettings:
     """Share of its matches with the model that must agree with its pose."""
     min_model: int = 3
     """Models of fewer photos do not count."""
+    min_points: int = 50
+    """Nor do models of fewer points: nothing holds their poses."""
     refine_principal_point: bool = False
     threads: int = 1
     """Of the mapper. One keeps results the same on every machine; large bundle adjustments gain from more."""
@@ -165,6 +167,7 @@ class SfmSettings:
             ("matching.words", self.matching.words, 2),
             ("mapping.init_trials", self.mapping.init_trials, 1),
             ("mapping.min_model", self.mapping.min_model, 2),
+            ("mapping.min_points", self.mapping.min_points, 1),
             ("mapping.threads", self.mapping.threads, 1),
             ("world.view_distance", self.world.view_distance, 0),
             ("min_photos", self.min_photos, 2),
@@ -200,8 +203,14 @@ class NormalSettings:
     """Of a ``custom`` network."""
     max_side: int = 1024
     """Long side of the stored maps; the import brings them to the size of the views."""
+    tile: int = 0
+    """Side, in pixels of the stored map, of the overlapping squares that go through the network one by one: finer
+    normals of a large photo (raise ``max_side``), and the memory of one tile. 0: the photo as a whole, shrunk to what
+    the network takes, which sees more of the scene and is the better guess where surfaces are plain."""
+    tile_overlap: float = 0.25
+    """Share of a tile that its neighbour sees, too; blended there."""
     check: bool = True
-    """Stop when the capture's points say that an axis is flipped."""
+    """Stop when the capture's points say that the axes are declared wrongly."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "axes", tuple(self.axes))
@@ -211,6 +220,10 @@ class NormalSettings:
             raise PrepareError("setting normals.model=custom needs normals.file, the ONNX file")
         if not self.max_side >= 32:
             raise PrepareError(f"setting normals.max_side={self.max_side}: must be at least 32")
+        if self.tile and not self.tile >= 64:
+            raise PrepareError(f"setting normals.tile={self.tile}: give 0 (no tiles) or at least 64 pixels")
+        if not 0 <= self.tile_overlap <= 0.5:
+            raise PrepareError(f"setting normals.tile_overlap={self.tile_overlap}: must lie between 0 and 0.5")
 
     @property
     def declared(self) -> NormalAdapter:

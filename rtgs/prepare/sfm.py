@@ -248,13 +248,19 @@ def _map(photos: PhotoSet, place: Workplace, settings: SfmSettings, say: Say) ->
             models = _global(place, settings)
         else:
             models = _incremental(place, settings, 0.5**trial, ticker)
-        models = [model for model in models if model.num_reg_images() >= settings.mapping.min_model]
+        models = [model for model in models if _counts(model, settings)]
         models.sort(key=_size, reverse=True)
         if models and (not best or _size(models[0]) > _size(best[0])):
             best = models
         if settings.mapping.mapper == "global" or (best and _is_good(best[0], photos, settings)):
             break
     return best, ticker.took
+
+
+def _counts(model: Any, settings: SfmSettings) -> bool:
+    """Is it a model at all? COLMAP also returns photos whose last points it has filtered away."""
+    wanted = settings.mapping
+    return model.num_reg_images() >= wanted.min_model and model.num_points3D() >= wanted.min_points
 
 
 def _size(model: Any) -> tuple[int, int]:

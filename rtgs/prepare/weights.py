@@ -1,7 +1,8 @@
 """Every pretrained file rtgs can use: those of the metrics and those of the preparation. Nothing is ever downloaded.
 
 The preparation's networks run through onnxruntime. Their files are exported by people (or taken from an export somebody
-published), so no digest is registered; a recipe states the digest of the file it used. Sizes are of common exports.
+published), so no digest is registered; a recipe states the digest of the file it used, and digests noted in a
+``SHA256SUMS`` of the folder of weights are checked. Sizes are of common exports.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from rtgs.evaluate.weights import (
     PretrainedFile,
     WeightStatus,
     WrongWeights,
+    check_noted_digest,
     find_weights,
     verify_weights,
     weight_folders,
@@ -24,6 +26,7 @@ __all__ = [
     "PretrainedFile",
     "WeightStatus",
     "WrongWeights",
+    "check_noted_digest",
     "find_weights",
     "verify_weights",
     "weight_folders",
@@ -115,7 +118,7 @@ PREPARATION: tuple[PretrainedFile, ...] = (
         licence="BSD-2-Clause",
         source="github.com/YvanYin/Metric3D",
         used_for="normals: monocular normals",
-        export="the authors' onnx/ folder",
+        export="take onnx/model.onnx of the published export onnx-community/metric3d-vit-small",
     ),
 )
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import math
 import sys
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
@@ -209,3 +211,29 @@ def test_sfm(run) -> None:
     assert figures["rows"] == [], "without the photo sets there is nothing to compare with"
     row = sfm.Row("fox", 5, 4, ("e.jpg",), 0.01, 0.02, 0.001, 0.002, 0.01, 0.5, 1.0, 2.0, 3.0, 900.0, 300.0)
     assert "| fox | 4 of 5 (not e.jpg) | 0.010, max 0.020 | 1.00, max 2.00 | +1.00% |" in sfm.table([row])
+
+
+def test_sfm_measures_a_set_once(run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("tokenizers")
+    pytest.importorskip("onnx")
+    from tests.prepare.glass_scene import shots, write_capture
+
+    root = write_capture(tmp_path / "shared/data/room", shots(6, 320, 240))
+    monkeypatch.setenv("RTGS_SHARED", str(tmp_path / "shared"))
+
+    def here(words: list[str], **_) -> SimpleNamespace:
+        with contextlib.redirect_stdout(io.StringIO()) as out:
+            sfm.main(words[words.index("--one") :])
+        return SimpleNamespace(returncode=0, stdout=out.getvalue().encode())
+
+    monkeypatch.setattr(sfm.subprocess, "run", here)  # the process of its own, without its imports
+    words = ("room", "--threads", "1", "--keep", str(tmp_path / "kept"))
+    figures = run(sfm, *words)
+    (row,) = figures["rows"]
+    assert (row["given"], row["found"], row["missing"]) == (6, 6, [])
+    assert row["rotation_max"] < 1
+    assert row["translation_max"] < 0.05
+    assert all(row[key] > 0 for key in ("seconds_per_photo", "cpu_per_photo", "memory_mb", "imports_mb"))
+    for path in (root / "images").iterdir():
+        path.unlink()
+    assert run(sfm, *words)["rows"] == [row], "nothing is measured again"

@@ -20,6 +20,7 @@ class Model:
     observations: int
     error: float
     side: int = 800
+    points: int = 100
     cameras: dict[int, SimpleNamespace] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -27,6 +28,9 @@ class Model:
 
     def num_reg_images(self) -> int:
         return self.photos
+
+    def num_points3D(self) -> int:
+        return self.points
 
     def compute_num_observations(self) -> int:
         return self.observations
@@ -48,6 +52,7 @@ GOOD = Model(50, 900, 0.4)
         ([[Model(50, 900, 0.7, side=400)], [Model(50, 800, 0.7, side=400)], [Model(40, 999, 0.1)]], 3, 0),
         ([[Model(50, 900, 1.1, side=1600)]], 1, 0),  # 0.55 at 800 a side
         ([[Model(2, 900, 0.1)], [], []], 3, None),  # too small to count
+        ([[Model(50, 0, 0.0, points=0)], [], [Model(9, 90, 0.5)]], 3, 2),  # photos, and no point that holds them
     ],
 )
 def test_the_best_attempt_counts(monkeypatch, tmp_path: Path, attempts, made: int, chosen: int | None) -> None:

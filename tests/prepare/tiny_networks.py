@@ -28,33 +28,44 @@ def save(path: Path, nodes, inputs, outputs, constants: dict[str, np.ndarray]) -
     return path
 
 
-def color_reader(path: Path, adapter: NormalAdapter, channels: int = 3, names=("image", "normal")) -> Path:
-    """A "normal network" that reads canonical normals painted as (n + 1) / 2 and tells them its family's way."""
-    weights, bias = reader_weights(adapter, channels)
-    inputs = [(names[0], [1, 3, "h", "w"])]
-    nodes = [helper.make_node("Conv", [names[0], "weights", "bias"], ["told"])]
+def color_reader(path: Path, adapter: NormalAdapter, blurred: bool = False, beside: tuple[str, ...] = ()) -> Path:
+    """A "normal network" that reads canonical normals painted as (n + 1) / 2 and tells them its family's way.
+
+    ``blurred``: the mean over its whole input, everywhere. ``beside``: outputs of one channel beside the normals.
+    """
+    weights, bias = reader_weights(adapter)
+    picture = adapter.input or "image"
+    inputs = [(picture, [1, 3, "h", "w"])]
+    nodes = [helper.make_node("Conv", [picture, "weights", "bias"], ["told"])]
     last = "told"
+    if blurred:
+        nodes += [
+            helper.make_node("GlobalAveragePool", ["told"], ["mean"]),
+            helper.make_node("Mul", ["told", "nothing"], ["blank"]),
+            helper.make_node("Add", ["blank", "mean"], ["even"]),
+        ]
+        last = "even"
     if adapter.intrinsics:
         inputs.append((adapter.intrinsics, [1, 3, 3]))
         nodes += [
             helper.make_node("ReduceSum", [adapter.intrinsics], ["sum"], keepdims=0),
             helper.make_node("Mul", ["sum", "nothing"], ["zero"]),
-            helper.make_node("Add", ["told", "zero"], ["moved"]),
+            helper.make_node("Add", [last, "zero"], ["moved"]),
         ]
         last = "moved"
-    output = adapter.output or names[1]
+    output = adapter.output or "normal"
     nodes.append(helper.make_node("Identity", [last], [output]))
+    nodes += [helper.make_node("ReduceMax", ["told"], [name], axes=[1]) for name in beside]
+    outputs = [(output, [1, 3, "h", "w"]), *((name, [1, 1, "h", "w"]) for name in beside)]
     constants = {"weights": weights, "bias": bias, "nothing": np.float32(0)}
-    return save(path, nodes, inputs, [(output, [1, channels, "h", "w"])], constants)
+    return save(path, nodes, inputs, outputs[::-1], constants)  # the normals are not the first
 
 
-def reader_weights(adapter: NormalAdapter, channels: int) -> tuple[np.ndarray, np.ndarray]:
+def reader_weights(adapter: NormalAdapter) -> tuple[np.ndarray, np.ndarray]:
     """1x1 convolution from the normalised picture to the family's numbers."""
     mean, std = np.asarray(adapter.mean), np.asarray(adapter.std)
     back = adapter.matrix.T.astype(np.float64)  # canonical to channels
     weights, bias = back * (2 * std), back @ (2 * mean - 1)
     if adapter.unit_range:
         weights, bias = weights / 2, bias / 2 + 0.5
-    rest = channels - 3
-    weights = np.concatenate([weights, np.zeros((rest, 3))])[..., None, None]
-    return weights.astype(np.float32), np.concatenate([bias, np.full(rest, 7.0)]).astype(np.float32)
+    return weights[..., None, None].astype(np.float32), bias.astype(np.float32)
