@@ -52,7 +52,7 @@ def report(params: ReportParams, context: StepContext) -> None:
     manifest = Manifest.read(training)
     assert manifest is not None
     decisions = [Decision(*item) for item in params.decisions]
-    decisions += _masks(inputs)
+    decisions += _prepared(inputs)
     decisions += [Decision(**item) for item in summary["decisions"]]  # pyright: ignore[reportGeneralTypeIssues]
     decisions += _mesh_decisions(inputs)
     decisions += _boundary(training)
@@ -74,15 +74,26 @@ def report(params: ReportParams, context: StepContext) -> None:
     context.tracker.artifact(context.out / PAGE)
 
 
-def _masks(inputs: Mapping[str, Path]) -> list[Decision]:
-    """How the masks were made: a classical fallback is named as such."""
-    if "masks" not in inputs:
-        return []
+def _prepared(inputs: Mapping[str, Path]) -> list[Decision]:
+    """How good the poses are and what to do about it, how masks (a classical fallback is named as such) and normals
+    were made."""
     from rtgs.prepare.masks_report import MaskReport
+    from rtgs.prepare.normals import read_message
+    from rtgs.prepare.quality import SfmReport
     from rtgs.report.page import Decision
+    from rtgs.scenes.capture import list_some
 
-    made = MaskReport.read(inputs["masks"])
-    return [Decision("masks", "; ".join((str(made), *made.notes)))]
+    lines = []
+    if "sfm" in inputs:
+        poses = SfmReport.read(inputs["sfm"])
+        missing = f"; without a pose: {list_some(poses.missing)}" if poses.missing else ""
+        lines += [Decision("poses", f"{poses}{missing}"), *(Decision("advice", line) for line in poses.advice)]
+    if "masks" in inputs:
+        made = MaskReport.read(inputs["masks"])
+        lines.append(Decision("masks", "; ".join((str(made), *made.notes))))
+    if "normals" in inputs:
+        lines.append(Decision("normals", read_message(inputs["normals"])))
+    return lines
 
 
 def _views(table: EvaluationTable, inputs: Mapping[str, Path], count: int) -> tuple[ReportView, ...]:
@@ -175,4 +186,4 @@ def _steps(context: StepContext) -> tuple[StepLine, ...]:
     return tuple(lines)
 
 
-STEP = StepKind("report", 3, report, helpers=("rtgs.report.page", "rtgs.report.figures", "rtgs.report.layers"))
+STEP = StepKind("report", 4, report, helpers=("rtgs.report.page", "rtgs.report.figures", "rtgs.report.layers"))

@@ -52,6 +52,12 @@ class NormalReport:
     message: str
 
 
+def read_message(folder: Path) -> str:
+    """In words, what :func:`make_normals` wrote into its folder."""
+    values = json.loads((folder / REPORT_FILE).read_text(encoding="utf-8"))
+    return f"{values['maps']} maps by {values['model']}; {values['message']}"
+
+
 def find_network(settings: NormalSettings) -> tuple[Path, str]:
     """The ONNX file in force and its SHA-256.
 

@@ -110,9 +110,9 @@ def read_photo_set(root: Path, images_dir: str | None = None) -> PhotoSet:
         photos.append(photo)
     photos, twins = _without_twins(photos)
     findings = [*_unreadable(unreadable, folder, len(files)), *_twins(twins, folder), *_sizes(photos, folder)]
-    findings += _raw_files(folder)
+    findings += [*_turned(photos, folder), *_raw_files(folder)]
     if not photos:
-        raise PrepareError(f"none of the {len(files)} photos in {folder} can be read: " + "; ".join(unreadable[:3]))
+        raise PrepareError(f"none of the {len(files)} photos in {folder} can be read: {list_some(unreadable, 3)}")
     return PhotoSet(root, folder, tuple(photos), tuple(findings))
 
 
@@ -210,6 +210,14 @@ def _sizes(photos: list[Photo], folder: Path) -> list[Finding]:
     few = len(groups) > max(2, len(photos) // 3)
     advice = "photos that were cropped one by one lose their lens: use the originals" if few else ""
     return [Finding("warning" if few else "info", what, str(folder), advice)]
+
+
+def _turned(photos: list[Photo], folder: Path) -> list[Finding]:
+    turned = [photo.name for photo in photos if photo.turned]
+    if not turned:
+        return []
+    what = f"{len(turned)} of {len(photos)} photos are stored on their side and turned upright as EXIF says: "
+    return [Finding("info", what + list_some(turned, 6), str(folder))]
 
 
 def _raw_files(folder: Path) -> list[Finding]:

@@ -390,6 +390,7 @@ def test_normals_reach_the_training(capture, tmp_path, monkeypatch, capsys):
     page = (run / "report.html").read_text()
     assert "normals" in page
     assert "no monocular normal loss" not in page
+    assert "4 maps by omnidata; predicted normals and the surfaces of" in page
     single = list((tmp_path / "root/store/single_normals").glob("*.npy"))
     assert len(single) == 4
 

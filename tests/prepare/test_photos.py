@@ -52,7 +52,10 @@ def test_turned_photos_are_laid_out_upright_and_keep_their_focal_length(tmp_path
     assert pixels[:, :20].mean() > pixels[:, -20:].mean() + 100, "the lower half of the stored photo is now on the left"
     assert turned.getexif()[ORIENTATION] == 1
     assert turned.getexif().get_ifd(EXIF)[FOCAL_35MM] == 28
-    assert {photo.camera for photo in read_photo_set(tmp_path / "in").photos} == {"Maker One 28 mm"}
+    found = read_photo_set(tmp_path / "in")
+    assert {photo.camera for photo in found.photos} == {"Maker One 28 mm"}
+    said = [finding.what for finding in found.findings]
+    assert said[-1] == "1 of 2 photos are stored on their side and turned upright as EXIF says: b.jpg"
 
 
 @pytest.mark.parametrize("orientation", [2, 3, 5, 8])

@@ -49,7 +49,7 @@ def test_photos_become_a_table(photos, tmp_path, capsys):
     assert "PSNR" in shown
     (run,) = (path for path in (tmp_path / "root/runs").iterdir() if path.is_dir())
     assert {"report.html", "sfm.json", "coverage.png", "metrics.json"} <= {path.name for path in run.iterdir()}
-    assert "sfm" in (run / "report.html").read_text()
+    assert "6 of 6 photos registered" in (run / "report.html").read_text()
     assert "7 from the cache, nothing to do" in " ".join(plan(capsys, *words)[-1])
     other = {row[0]: row for row in plan(capsys, *words, "sfm=fast") if len(row) > 3}
     assert "settings.features.max_side: 1600 -> 1000" in other["sfm"][3]
