@@ -143,13 +143,15 @@ def advise(evidence: Evidence, settings: SfmSettings, error: float = 0.0, track:
     advice: list[str] = []
     groups = groups_of(evidence.counts, _LINK * settings.matching.min_inliers)
     large = [group for group in groups if len(group) >= max(3, _GROUP_SHARE * total)]
-    if len(large) > 1:
+    placed = [sum(names[index] in evidence.registered for index in group) for group in large]
+    if len(large) > 1 and any(2 * count < len(group) for count, group in zip(placed, large)):
         listed = "; ".join(f"{len(group)} photos ({names[group[0]]} ... {names[group[-1]]})" for group in large[:4])
         advice.append(
             f"the photos form {len(large)} groups that share no view: {listed}. If these are different scenes, put "
             "each into a folder of its own; if it is one scene, take photos that lead over from one group to the other"
         )
-    lonely = [names[group[0]] for group in groups if len(group) == 1 and total > 1]
+    single = [names[group[0]] for group in groups if len(group) == 1 and total > 1]
+    lonely = [name for name in single if name not in evidence.registered]
     if lonely:
         advice.append(
             f"{len(lonely)} photos match no other ({list_some(lonely, 6)}): blurred, of something else, or too far "

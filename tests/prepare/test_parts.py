@@ -117,10 +117,15 @@ def test_advice_names_what_is_wrong():
     split = joined.copy()
     split[:4, 4:] = split[4:, :4] = 0
     assert groups_of(split, 30) == [[0, 1, 2, 3], [4, 5, 6, 7]]
-    assert "2 groups that share no view: 4 photos (0.jpg ... 3.jpg)" in advise(evidence(split), options)[0]
+    half = frozenset(f"{index}.jpg" for index in range(4))
+    told = advise(evidence(split, registered=half), options)
+    assert "2 groups that share no view: 4 photos (0.jpg ... 3.jpg)" in told[0]
+    assert advise(evidence(split), options) == [], "one model holds both: weak matches joined them"
     lonely = joined.copy()
     lonely[2, :] = lonely[:, 2] = 0
-    assert advise(evidence(lonely), options)[0].startswith("1 photos match no other (2.jpg)")
+    others = frozenset(f"{index}.jpg" for index in range(8) if index != 2)
+    assert advise(evidence(lonely, registered=others), options)[0].startswith("1 photos match no other (2.jpg)")
+    assert advise(evidence(lonely), options) == []
     assert "fewer than 600 features" in advise(evidence(joined, keypoints=np.full(8, 90)), options)[0]
     few = frozenset(["0.jpg", "1.jpg"])
     assert "no parallax" in advise(evidence(joined, turning=0.9, registered=few), options)[0]

@@ -13,6 +13,7 @@ from PIL import Image
 from rtgs.prepare import sfm
 from rtgs.prepare.compare import compare_poses
 from rtgs.prepare.errors import PrepareError
+from rtgs.prepare.photos import lay_out, read_photo_set
 from rtgs.prepare.poses import Request, find_poses
 from rtgs.prepare.quality import SfmReport
 from rtgs.prepare.settings import FeatureSettings, MappingSettings, MatchingSettings, SfmSettings
@@ -201,6 +202,29 @@ def test_other_ways_to_pair_and_to_map_find_the_same(room, tmp_path):
     errors = compare_poses(read_capture(SceneSettings(path=str(out))).views, given_views(walk(COUNT)))
     assert errors.found == 1
     assert np.median(errors.rotation) < 0.5
+
+
+def test_exif_gives_the_focal_length_to_start_from(tmp_path):
+    """28 mm on film of 35 mm; a photo without EXIF starts from 1.2 of its long side."""
+    import pycolmap
+
+    first, second = write_photos(tmp_path / "photos", walk(2))
+    picture = Image.open(second)
+    exif = picture.getexif()
+    exif.get_ifd(0x8769)[0xA405] = 28
+    picture.save(second, exif=exif)
+    place = sfm.Workplace(tmp_path / "work")
+    place.photos.mkdir(parents=True)
+    photos = read_photo_set(tmp_path / "photos")
+    lay_out(photos, place.photos, (0.0, 0.0, 0.0), lambda _: None)
+    sfm._register(photos, place, QUICK)
+    with pycolmap.Database.open(str(place.database)) as database:
+        images = {image.name: database.read_camera(image.camera_id) for image in database.read_all_images()}
+    with_exif, without = images[second.name], images[first.name]
+    assert with_exif.has_prior_focal_length
+    assert with_exif.params[0] == pytest.approx(28 / 36 * WIDTH, rel=0.05)
+    assert not without.has_prior_focal_length
+    assert without.params[0] == pytest.approx(1.2 * WIDTH)
 
 
 def test_a_feature_without_its_model_says_so(room, tmp_path, monkeypatch):
