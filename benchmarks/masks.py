@@ -4,9 +4,10 @@
 with the hull of all: first the true masks (none should be flagged), then with a share of them spoilt (half missing,
 moved, empty, far too large), which should be found and repaired. Then by hand: GrabCut from boxes around the true masks
 in three photos and in all, and the hull of eight true outlines. ``--networks FOLDER`` instead times GroundingDINO and
-SAM 2 at their real size (tiny variants) with random weights, exported into FOLDER where they are not there yet (needs
-transformers): seconds and memory do not depend on the weights. ``--clock``: the glass door of ``glass_clock`` in
-``$RTGS_SHARED/data``, drawn in one or two photos and carried to others. The last line is a JSON object.
+SAM 2 (``--part``: one of them) at their real size (tiny variants) with random weights, exported into FOLDER where they
+are not there yet (needs transformers): seconds and memory do not depend on the weights. ``--clock``: the glass door of
+``glass_clock`` in ``$RTGS_SHARED/data``, drawn in one or two photos and carried to others. The last line is a JSON
+object.
 """
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import subprocess
+import sys
 import tempfile
 import time
 from dataclasses import asdict, dataclass
@@ -31,6 +34,7 @@ from rtgs.scenes.importers import read_capture
 from rtgs.scenes.settings import SceneSettings
 
 SCENES = ("ball_statue", "popcorn_cup", "real_bottle", "tall_bottle")
+PARTS = ("segmenter", "detector")
 CLOCK_MARKS = Path(__file__).with_name("glass_clock_marks.yaml")
 
 
@@ -93,7 +97,6 @@ def measure(scene: str, share: float, folder: Path) -> Row:
     for name, mask in truth.items():
         write_mask(mask, mask_path(folder / "good", name))
         write_mask(bad.get(name, mask), mask_path(folder / "bad", name))
-    settings = MaskSettings(given=GivenSettings(folder="masks"), clean=CleanSettings(action="repair"))
     settings = MaskSettings(given=GivenSettings(folder="masks"), clean=CleanSettings(action="repair"))
     began = time.process_time()
     good = run(scene, "given", settings, folder / "good", folder / "1")
@@ -188,52 +191,66 @@ def clock_door() -> dict[str, float]:
     }
 
 
-def time_networks(folder: Path, photos: int) -> dict[str, float]:
-    """Seconds a photo of 800 x 600 takes, by network, and the peak of memory, with random weights."""
+@dataclass(frozen=True)
+class NetworkTimes:
+    """What a network takes for a photo of 800 x 600, with random weights; medians."""
+
+    seconds: float
+    cpu_seconds: float  # of all threads
+    load_seconds: float  # CPU, once
+    memory_mb: float  # peak of the process
+    imports_mb: float  # of it, before the network was loaded
+
+
+def time_network(part: str, folder: Path, photos: int) -> NetworkTimes:
+    """The detector for one phrase, or the segmenter for one box."""
     from rtgs.prepare.masks_detect import Box, Detector, PromptTokenizer
     from rtgs.prepare.masks_segment import Segmenter
     from rtgs.prepare.masks_settings import DetectorSettings, SegmenterSettings
     from rtgs.prepare.onnx import Network
 
-    files = _random_networks(folder)
-    before = peak_memory_mb()
-    tokenizer = PromptTokenizer(files[1])
-    detect = Detector(Network(files[0]), tokenizer, DetectorSettings(prompt="glass"))
-    segment = Segmenter(Network(files[2]), Network(files[3]), SegmenterSettings(min_score=0.0))
+    before, began = peak_memory_mb(), time.process_time()
     photo = np.random.default_rng(0).random((600, 800, 3), dtype=np.float32)
-    detect(photo)
-    boxes = [Box(100.0, 100.0, 500.0, 400.0, 1.0, "glass")]
-    segment(photo, boxes)
-    seconds = {}
-    for name, work in (("detector_a_phrase", lambda: detect(photo)), ("segmenter", lambda: segment(photo, boxes))):
-        times = []
-        for _ in range(photos):
-            began = time.perf_counter()
-            work()
-            times.append(time.perf_counter() - began)
-        seconds[name] = float(np.median(times))
-    return {**seconds, "memory_mb": peak_memory_mb(), "memory_before_mb": before}
+    if part == "detector":
+        model, tokens = folder / "grounding_dino/model.onnx", folder / "grounding_dino/tokenizer.json"
+        detect = Detector(Network(model), PromptTokenizer(tokens), DetectorSettings(prompt="glass"))
+    else:
+        encoder, decoder = Network(folder / "sam2/encoder.onnx"), Network(folder / "sam2/decoder.onnx")
+        segment = Segmenter(encoder, decoder, SegmenterSettings(min_score=0.0))
+        boxes = [Box(100.0, 100.0, 500.0, 400.0, 1.0, "glass")]
+    loaded = time.process_time() - began
+    times = []
+    for _ in range(photos + 1):  # the first one fills caches
+        wall, cpu = time.perf_counter(), time.process_time()
+        detect(photo) if part == "detector" else segment(photo, boxes)
+        times.append((time.perf_counter() - wall, time.process_time() - cpu))
+    wall, cpu = np.median(times[1:], axis=0).tolist()
+    return NetworkTimes(wall, cpu, loaded, peak_memory_mb(), before)
 
 
-def _random_networks(folder: Path) -> tuple[Path, ...]:
-    """Detector, tokenizer, encoder, decoder of the real sizes; made by a process of its own, with its own memory."""
-    import subprocess
-    import sys
+def time_networks(folder: Path, photos: int, parts: tuple[str, ...]) -> dict[str, dict[str, float]]:
+    """Each network in a process of its own, with its own memory; made before where its file is not there."""
+    figures = {}
+    for part in parts:
+        words = [sys.executable, "-m", "benchmarks.masks", "--part", part, "--photos", str(photos)]
+        if not (folder / ("grounding_dino/model.onnx" if part == "detector" else "sam2/decoder.onnx")).is_file():
+            subprocess.run([*words, "--make", str(folder)], check=True)
+        done = subprocess.run([*words, "--one", str(folder)], check=True, stdout=subprocess.PIPE)
+        figures[part] = json.loads(done.stdout.splitlines()[-1])
+    return figures
 
-    names = ("grounding_dino/model.onnx", "grounding_dino/tokenizer.json", "sam2/encoder.onnx", "sam2/decoder.onnx")
-    files = tuple(folder / name for name in names)
-    if not all(path.is_file() for path in files):
-        subprocess.run([sys.executable, "-m", "benchmarks.masks", "--make", str(folder)], check=True)
-    return files
 
-
-def make_networks(folder: Path) -> None:
-    """Export the real architectures with random weights."""
+def make_networks(folder: Path, part: str) -> None:
+    """Export a real architecture with random weights."""
     import transformers
     from tokenizers import Tokenizer, models, pre_tokenizers, processors
 
     from rtgs.prepare.masks_export import export_grounding_dino, export_sam2
 
+    if part == "segmenter":
+        model = transformers.Sam2Model(transformers.Sam2Config())
+        export_sam2(model, folder / "sam2/encoder.onnx", folder / "sam2/decoder.onnx")
+        return
     words = {f"[unused{index}]": index for index in range(1013)}
     ids = {"[PAD]": 0, "[UNK]": 100, "[CLS]": 101, "[SEP]": 102, ".": 1012, "glass": 500}
     words = {word: index for word, index in words.items() if index not in ids.values()} | ids
@@ -243,9 +260,6 @@ def make_networks(folder: Path) -> None:
     tokenizer.post_processor = processors.TemplateProcessing(single="[CLS] $A [SEP]", special_tokens=ends)
     (folder / "grounding_dino").mkdir(parents=True, exist_ok=True)
     tokenizer.save(str(folder / "grounding_dino/tokenizer.json"))
-    export_sam2(
-        transformers.Sam2Model(transformers.Sam2Config()), folder / "sam2/encoder.onnx", folder / "sam2/decoder.onnx"
-    )
     dino = transformers.GroundingDinoForObjectDetection(transformers.GroundingDinoConfig())
     export_grounding_dino(dino, folder / "grounding_dino/model.onnx")
 
@@ -256,15 +270,21 @@ def main() -> None:
     parser.add_argument("scenes", nargs="*", default=SCENES, metavar="SCENE")
     parser.add_argument("--spoilt", type=float, default=0.15, help="share of the masks (default: %(default)s)")
     parser.add_argument("--networks", type=Path, help="time the networks, whose files lie here or are made here")
+    parser.add_argument("--part", choices=PARTS, help="of the networks (default: both, one after the other)")
     parser.add_argument("--clock", action="store_true", help="carry the door of the real capture glass_clock")
     parser.add_argument("--photos", type=int, default=5, help="timed, median (default: %(default)s)")
     parser.add_argument("--make", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("--one", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.make is not None:
-        make_networks(options.make)
+        make_networks(options.make, options.part)
+        return
+    if options.one is not None:
+        print(json.dumps(asdict(time_network(options.part, options.one, options.photos))))
         return
     if options.networks is not None:
-        print(json.dumps({"machine": machine(), "networks": time_networks(options.networks, options.photos)}))
+        parts = (options.part,) if options.part else PARTS
+        print(json.dumps({"machine": machine(), "networks": time_networks(options.networks, options.photos, parts)}))
         return
     if options.clock:
         print(json.dumps({"clock_door_pixels": clock_door()}))

@@ -17,6 +17,7 @@ from benchmarks import (
     captures,
     gaussians,
     losses,
+    masks,
     raster,
     raster_ellipsoids,
     sfm,
@@ -237,3 +238,17 @@ def test_sfm_measures_a_set_once(run, tmp_path: Path, monkeypatch: pytest.Monkey
     for path in (root / "images").iterdir():
         path.unlink()
     assert run(sfm, *words)["rows"] == [row], "nothing is measured again"
+
+
+@pytest.mark.parametrize("part", ["detector", "segmenter"])
+def test_masks_times_a_network(run, part: str, tmp_path: Path) -> None:
+    """Tiny networks with the ports of the real ones, already in their places: none is made."""
+    pytest.importorskip("tokenizers")
+    pytest.importorskip("onnx")
+    pytest.importorskip("onnxruntime")
+    from tests.prepare.glass_scene import write_networks
+
+    write_networks(tmp_path)
+    figures = run(masks, "--part", part, "--photos", "1", "--one", str(tmp_path))
+    assert set(figures) == {"seconds", "cpu_seconds", "load_seconds", "memory_mb", "imports_mb"}
+    assert all(value > 0 for value in figures.values())
