@@ -110,6 +110,8 @@ STEP = StepKind(
         "rtgs.methods.traced_set",
         "rtgs.methods.transmittance",
         "rtgs.methods.glass",
+        "rtgs.methods.glass_evidence",
+        "rtgs.methods.glass_stage",
         "rtgs.mesh.container",
         "rtgs.methods.mirror",
         "rtgs.methods.traced_pixels",

@@ -49,7 +49,7 @@ def _numbers(scores: BoundaryScores, when: str) -> dict[str, float]:
 
 STEP = StepKind(
     "train_transmittance",
-    2,
+    3,
     train_transmittance,
     helpers=(
         *train_reflection.STEP.helpers,
@@ -57,6 +57,8 @@ STEP = StepKind(
         "rtgs.methods.transmittance_set",
         "rtgs.methods.interface_set",
         "rtgs.methods.glass",
+        "rtgs.methods.glass_evidence",
+        "rtgs.methods.glass_stage",
         "rtgs.evaluate.boundary",
         "rtgs.mesh.container",
         "rtgs.mesh.guide",

@@ -19,7 +19,7 @@ class Transparency(NamedTuple):
 
 
 def find_transparency(config: RunConfig, prepared: Preparation) -> Transparency:
-    """Look at the masks of the capture, as far as the first that is not empty. A step that makes masks is believed:
+    """Look at the masks of the capture, as far as the first that bounds something. A step that makes masks is believed:
     should they be empty, the third stage says so and changes nothing.
 
     Raises:
@@ -32,11 +32,20 @@ def find_transparency(config: RunConfig, prepared: Preparation) -> Transparency:
     files = _mask_files(config)
     if not files:
         return Transparency(False, "the scene has no masks of transparent objects")
+    from rtgs.mesh.silhouettes import COVERED
     from rtgs.scenes.images import read_mask
 
+    full = 0
     for path in files:
-        if read_mask(path).any():
+        share = float(read_mask(path).mean())
+        if 0 < share < COVERED:
             return Transparency(True, f"{path.name} shows a transparent object")
+        full += share >= COVERED
+    if full:
+        why = (
+            f"{full} of {len(files)} masks cover the whole picture, the others are empty: nothing tells glass from room"
+        )
+        return Transparency(False, why)
     return Transparency(False, f"all {len(files)} masks of the scene are empty")
 
 

@@ -15,7 +15,12 @@ from rtgs.errors import RtgsError
 from rtgs.mesh.guide import MeshGuide
 from rtgs.mesh.triangles import TriangleMesh
 
-_COVERED = 0.999  # share of the picture from which on a mask says that everything is the object
+COVERED = 0.999  # share of the picture from which on a mask says that everything is the object
+
+
+def bounding(mask: Tensor | None) -> Tensor | None:
+    """The mask, or None for one that covers the whole picture: it tells object from scene no better than no mask."""
+    return None if mask is None or float(mask.float().mean()) >= COVERED else mask
 
 
 @dataclass(frozen=True)
@@ -69,8 +74,8 @@ def mask_set(
             )
         share = float(mask.float().mean())
         empty += share == 0
-        full += share >= _COVERED
-        if 0 < share < _COVERED:
+        full += share >= COVERED
+        if 0 < share < COVERED:
             views.append(MaskView(camera, mask.bool(), None if depths is None else depths[index]))
     if not views:
         why = "there are no masks"

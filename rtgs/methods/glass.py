@@ -9,7 +9,7 @@ from torch import Tensor
 
 from rtgs.mesh.container import ObjectSurfaces
 from rtgs.methods.base import FirstBounce
-from rtgs.methods.mirror import SurfacePixels
+from rtgs.methods.mirror import SHORTEST_NORMAL, SurfacePixels
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Transmission:
 
 
 def glass_pixels(
-    flat: SurfacePixels, surfaces: ObjectSurfaces, inside: Tensor, *, first_surface: str, normal: str
+    flat: SurfacePixels, surfaces: ObjectSurfaces, inside: Tensor, glass: Tensor, *, first_surface: str, normal: str
 ) -> GlassPixels:
     """Put the mesh's surface where it is known: ``first_surface`` and ``normal`` are "mesh" or "base".
 
@@ -57,17 +57,26 @@ def glass_pixels(
         flat: the rasterised surface of all H * W pixels.
         surfaces: of the object's mesh.
         inside: (H, W) bool: pixels that show the object.
+        glass: (H, W) bool: the mesh's first surface is one of the object's, not a lid or a label.
     """
-    inside, hit = inside.flatten(), surfaces.hit.flatten()
-    known = inside & hit
+    inside, met = inside.flatten(), inside.flatten() & surfaces.hit.flatten()
+    known = met & glass.flatten()
     if first_surface == "mesh":
         flat = replace(flat, depth=torch.where(known, surfaces.near.flatten(), flat.depth))
     if normal == "mesh":
         flat = replace(flat, normal=torch.where(known, surfaces.normal.flatten(1), flat.normal))
-    near, second = flat.depth.detach(), surfaces.second.flatten() & known
+    near, second = flat.depth.detach(), surfaces.second.flatten() & met
     # A mesh away from the rasterised surface must not put the back before the front.
     far = torch.where(second, torch.maximum(surfaces.far.flatten(), near), near)
     return GlassPixels(flat, inside, far, second)
+
+
+def widened(inside: Tensor, pixels: int) -> Tensor:
+    """(H, W) bool with ``pixels`` more on every side."""
+    if pixels == 0:
+        return inside
+    grown = torch.nn.functional.max_pool2d(inside[None].float(), 2 * pixels + 1, stride=1, padding=pixels)
+    return grown[0] > 0
 
 
 def glass_rays(glass: GlassPixels, index: Tensor, center: Tensor, view: Tensor) -> GlassRays:
@@ -89,3 +98,11 @@ def depth_loss(bounce: FirstBounce, form: str, pixels: int) -> Tensor:
         return bounce.beyond.clamp_min(0).sum() / pixels
     depth = bounce.depth / bounce.alpha.clamp_min(1e-3) if form == "mean" else bounce.depth
     return (depth - bounce.thickness).clamp_min(0).sum() / pixels
+
+
+def mesh_normal_loss(normal: Tensor, target: Tensor, where: Tensor) -> Tensor:
+    """Mean over all pixels of 1 - n . N in the pixels ``where`` (H, W) bool; n of any length, N unit, (3, H, W)."""
+    index = where.flatten().nonzero()[:, 0]
+    n, unit = normal.flatten(1)[:, index], target.flatten(1)[:, index]
+    cosine = (n * n.square().sum(0).clamp_min(SHORTEST_NORMAL**2).rsqrt() * unit).sum(0)
+    return (1 - cosine).sum() / where.numel()

@@ -38,12 +38,12 @@ def normal_quaternions(normals: Tensor) -> Tensor:
 
 
 def interface_surfels(
-    settings: MethodSettings, mesh: ObjectMesh, colors_of: Surfels, generator: torch.Generator
+    settings: MethodSettings, mesh: ObjectMesh, glass: Tensor, colors_of: Surfels, generator: torch.Generator
 ) -> MaterialSurfels:
-    """Surfels spread over the mesh, with its normals, the colour of the nearest of ``colors_of``, and materials of
-    their own."""
+    """Surfels spread over the faces ``glass`` (F,) bool of the mesh, with its normals, the colour of the nearest of
+    ``colors_of``, and materials of their own."""
     own = settings.transmittance.interface
-    points, normals = mesh.sample(own.count, generator)
+    points, normals = mesh.sample(own.count, generator, glass.numpy())
     _, nearest = KDTree(colors_of.means.detach().double().numpy()).query(points.double().numpy())
     spacing = own.scale * neighbor_distance(points, settings.init.neighbors)
     plain = Surfels(

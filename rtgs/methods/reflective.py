@@ -220,7 +220,9 @@ class ReflectiveMethod(SurfelMethod):
         if glass is None:
             return reflection, torch.zeros(())
         inside = pixel_weights(rays.cosine, pixels, optics if gain is None else replace(optics, max_gain=gain))
-        return torch.where(glass, inside.reflection, reflection), inside.transmission
+        largest = self.settings.transmittance.max_weight
+        own = inside.reflection.clamp_max(largest) if largest > 0 else inside.reflection
+        return torch.where(glass, own, reflection), inside.transmission
 
     def _flat_pixels(self, buffers: RasterBuffers) -> SurfacePixels:
         """Every pixel of the view, flattened."""
@@ -350,10 +352,15 @@ class ReflectiveMethod(SurfelMethod):
             value = self.perceptual(rendered.image, view.image, self.generator)
             found = found.plus("perceptual", value, loss.perceptual)
         wanted = loss.specular > 0 and self.settings.transmittance.enabled
-        if wanted and view.mask is not None and step >= loss_start(loss.specular_start, total):
-            value = (view.mask * (loss.specular_target - rendered.specular).clamp_min(0)).mean()
+        mask = self.glass_mask(view) if wanted else None
+        if mask is not None and step >= loss_start(loss.specular_start, total):
+            value = (mask * (loss.specular_target - rendered.specular).clamp_min(0)).mean()
             found = found.plus("specular", value, loss.specular)
         return found
+
+    def glass_mask(self, view: View) -> Tensor | None:
+        """(H, W) bool: where L_spec acts."""
+        return view.mask
 
     # ---- state
 

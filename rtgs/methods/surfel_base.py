@@ -194,7 +194,7 @@ class SurfelMethod:
             add("normal", self._normal_consistency(buffers, rendered.camera), weights.normal)
         if _on(self.starts.mono_normal, step) and view.normal is not None:
             weight = weights.mono_normal * weights.mono_normal_gain
-            add("mono_normal", self._mono_normal(buffers, view.normal, rendered.camera), weight)
+            add("mono_normal", self._mono_normal(buffers, view, rendered.camera), weight)
         if _on(self.starts.distortion, step):
             assert buffers.distortion is not None
             add("distortion", distortion_loss(buffers.distortion), weights.distortion)
@@ -218,15 +218,19 @@ class SurfelMethod:
             depth_override=surface_depth(depth, buffers.alpha, buffers.median_depth, ratio) if ratio > 0 else None,
         )
 
-    def _mono_normal(self, buffers: RasterBuffers, target: Tensor, camera: Camera) -> Tensor:
-        """L_mono, depth-weighted like L_norm (methods.md 5)."""
+    def _mono_normal(self, buffers: RasterBuffers, view: View, camera: Camera) -> Tensor:
+        """L_mono, depth-weighted like L_norm (methods.md 5); transparent objects may count more."""
         loss = self.settings.loss
         assert buffers.normal is not None
+        assert view.normal is not None
         weight = None
         if loss.normal_inverse_depth:
             assert buffers.depth is not None
             weight = inverse_depth_weights(buffers.depth, buffers.alpha)
-        return mono_normal_loss(buffers.normal, target, camera, form=loss.mono_normal_form, weight=weight)
+        if loss.mono_normal_masked != 1 and view.mask is not None:
+            masked = torch.where(view.mask, loss.mono_normal_masked, 1.0)
+            weight = masked if weight is None else weight * masked
+        return mono_normal_loss(buffers.normal, view.normal, camera, form=loss.mono_normal_form, weight=weight)
 
     def after_step(self, step: int) -> tuple[StepEvent, ...]:
         """Adam, then what the schedule asks of the base set before the next step.

@@ -9,169 +9,34 @@ import torch
 from torch import Tensor
 
 from rtgs.cameras import Camera
-from rtgs.errors import RtgsError
 from rtgs.gaussians.materials import MaterialSurfels
 from rtgs.gaussians.surfels import ActivatedSurfels, Surfels
-from rtgs.mesh.container import ObjectGuide, ObjectMesh
-from rtgs.methods.base import Decision, FirstBounce, LossTerms, RenderedView, RenderOptions, Stage, StepEvent
-from rtgs.methods.glass import GlassPixels, GlassRays, Transmission, depth_loss, glass_pixels
-from rtgs.methods.interface_set import InterfaceSet, interface_surfels
-from rtgs.methods.mirror import SHORTEST_NORMAL, SurfacePixels
-from rtgs.methods.reflection_set import ReflectionSet
-from rtgs.methods.reflective import ReflectiveMethod
-from rtgs.methods.traced_set import FollowingTree, trace_set
-from rtgs.methods.transmittance_set import initial_box, random_surfels, rows_inside, take_out
+from rtgs.mesh.container import ObjectSurfaces
+from rtgs.mesh.silhouettes import bounding
+from rtgs.methods.base import FirstBounce, LossTerms, RenderedView, RenderOptions, StepEvent
+from rtgs.methods.glass import GlassPixels, GlassRays, Transmission, depth_loss, glass_pixels, mesh_normal_loss, widened
+from rtgs.methods.glass_stage import GlassStage
+from rtgs.methods.mirror import SurfacePixels
+from rtgs.methods.traced_set import trace_set
 from rtgs.render.buffers import TraceBuffers, TraceOptions
 from rtgs.train.schedule import (
     densify_ahead,
     densify_due,
     loss_start,
     opacity_reset_due,
-    reflection_plan,
     sh_degree_at,
-    transmittance_plan,
 )
-from rtgs.train.settings import MethodSettings, ScheduleSettings
 
 if TYPE_CHECKING:
-    from rtgs.scenes.scene import Scene, View
-
-_BEGUN = "third_stage"  # in the state: the stage has begun
+    from rtgs.scenes.scene import View
 
 
-class TransmissiveMethod(ReflectiveMethod):
+class TransmissiveMethod(GlassStage):
     """Base, reflection and transmittance set: image = (1 - k_s) C_d + k_s (w_r C_r + w_t C_t) in transparent objects.
 
     C_t is what a straight ray meets first in the transmittance set and then, from the object's back surface on, in the
     base set. ``object_mesh``: the object's surface; without one the method ends with its second stage.
     """
-
-    def __init__(
-        self,
-        settings: MethodSettings,
-        scene: Scene,
-        schedule: ScheduleSettings,
-        generator: torch.Generator,
-        object_mesh: ObjectMesh | None = None,
-    ) -> None:
-        super().__init__(settings, scene, schedule, generator)
-        self.through = transmittance_plan(settings.transmittance, schedule)
-        self.guide: ObjectGuide | None = None
-        self.transmittance: ReflectionSet | None = None
-        self.interface: InterfaceSet | None = None
-        self.transparent = False  # the stage has begun
-        self._from_base = False  # the transmittance set was taken from the base set
-        self._base_tree = FollowingTree(settings.transmittance.rebuild_every)
-        self._masked = any(view.mask is not None and bool(view.mask.any()) for view in scene.train)
-        if object_mesh is not None and settings.transmittance.enabled:
-            self.guide = ObjectGuide(object_mesh)
-            self.stages = self.declare_stages(settings, schedule, transparent=True)
-            self.base_schedule = self.through.base
-            plan = reflection_plan(settings.reflection, self.base_schedule)
-            frozen = min(plan.propagation_until, self.through.start)
-            self.plan = replace(plan, propagation_until=frozen) if settings.transmittance.freeze_base else plan
-
-    @staticmethod
-    def declare_stages(
-        settings: MethodSettings, schedule: ScheduleSettings, transparent: bool = False
-    ) -> tuple[Stage, ...]:
-        """The stages of a run; the third is of scenes with a ``transparent`` object only.
-
-        Raises:
-            ValueError: the third stage would start before the second.
-        """
-        stages = ReflectiveMethod.declare_stages(settings, schedule)
-        start = transmittance_plan(settings.transmittance, schedule).start
-        if not (transparent and settings.transmittance.enabled and stages[-1].name == "reflection"):
-            return stages
-        if start >= schedule.total:
-            return stages
-        if start <= stages[-1].from_step:
-            raise ValueError(
-                f"method.transmittance.start={settings.transmittance.start:g} is step {start} of {schedule.total}, but "
-                f"the reflection stage before it starts at step {stages[-1].from_step} "
-                f"(method.reflection.start={settings.reflection.start:g}): let it start later"
-            )
-        third = Stage("transmittance", start, schedule.total)
-        return (*stages[:-1], replace(stages[-1], until=start), third)
-
-    @property
-    def sets(self):
-        return (*super().sets, *(part for part in (self.transmittance, self.interface) if part is not None))
-
-    # ---- the beginning
-
-    def begin(self, stage: Stage) -> tuple[StepEvent, ...]:
-        """The transmittance stage: base surfels inside the object become its set, the interface is put on the mesh."""
-        if stage.name != "transmittance":
-            return super().begin(stage)
-        if self.guide is None:
-            raise RtgsError("the transmittance stage needs the transparent object's mesh: run extract_mesh before it")
-        if not self._masked:
-            why = "the masks of the training views are empty"
-            self.decisions = (*self.decisions, Decision("no transmittance stage", why))
-            return (StepEvent("decision", "transmittance", f"left out: {why}"),)
-        events = list(self._add_reflection()) if self.reflection is None else []
-        self.transparent = True
-        mesh, settings = self.guide.mesh, self.settings.transmittance
-        if settings.interface.count > 0:
-            assert isinstance(self.base.surfels, Surfels)
-            made = interface_surfels(self.settings, mesh, self.base.surfels, self.generator)
-            self.interface = self._interface_set(made)
-            events.append(StepEvent("begin", "interface", f"{len(made)} surfels on the {mesh.source} mesh"))
-        if settings.first_bounce == "transmittance":
-            events.append(self._add_transmittance(mesh))
-        return tuple(events)
-
-    def _add_transmittance(self, mesh: ObjectMesh) -> StepEvent:
-        settings = self.settings.transmittance
-        inside = torch.zeros(len(self.base), dtype=torch.bool)
-        if settings.split:
-            assert isinstance(self.base.surfels, Surfels)
-            inside = rows_inside(self.base.surfels, mesh, settings.split_margin * mesh.voxel)
-        found = int(inside.sum())
-        if settings.init.min_points <= found < len(inside):
-            surfels, detail = take_out(self.base, inside), f"{found} base surfels inside the object"
-            self._from_base = True
-            self._base_tree.clear()
-        else:
-            cameras = [view.camera for view in self._views]
-            box = initial_box(settings, mesh, cameras, self._points)
-            surfels = random_surfels(settings, box, self.generator)
-            why = f", for only {found} base surfels are inside the object" if settings.split else ""
-            detail = f"{len(surfels)} random surfels in the box of the {settings.box}{why}"
-        self.transmittance = self._transmittance_set(surfels)
-        return StepEvent("begin", "transmittance", detail)
-
-    def _transmittance_set(self, surfels: Surfels) -> ReflectionSet:
-        settings = self.settings.transmittance
-        return ReflectionSet(
-            "transmittance",
-            surfels,
-            optimizer=self.settings.optimizer,
-            density=settings.density,
-            means_lr_steps=self.through.own.means_lr_steps,
-            extent=self.extent,
-            rebuild_every=settings.rebuild_every,
-        )
-
-    def _interface_set(self, surfels: MaterialSurfels) -> InterfaceSet:
-        made = InterfaceSet(
-            "interface",
-            surfels,
-            optimizer=self.settings.optimizer,
-            density=self.settings.density,
-            means_lr_steps=self.schedule.means_lr_steps,
-            extent=self.extent,
-        )
-        made.floor = self.settings.transmittance.interface.floor
-        return made
-
-    def _judge(self, following: int) -> list[StepEvent]:
-        """A scene with masks is not matte: they show its transparent object."""
-        if not self._masked:
-            return super()._judge(following)
-        return [StepEvent("decision", "reflection", "goes on: the scene has masks of a transparent object")]
 
     # ---- rendering
 
@@ -195,7 +60,7 @@ class TransmissiveMethod(ReflectiveMethod):
         if not self.transparent or settings.first_bounce == "none":
             return None
         assert self.guide is not None
-        surfaces = self.guide.surfaces(camera)
+        surfaces, mask = self.guide.surfaces(camera), bounding(mask)
         source = "given" if options is None else options.masks or settings.test_masks
         if source == "silhouette" or mask is None:  # a view without a mask shows the object all the same
             inside = surfaces.hit
@@ -203,7 +68,13 @@ class TransmissiveMethod(ReflectiveMethod):
             inside = mask
         else:
             inside = mask & surfaces.hit  # methods.md 6.3: where the ray misses the mesh nothing is transmitted
-        return glass_pixels(flat, surfaces, inside, first_surface=settings.first_surface, normal=settings.normal)
+        inside = widened(inside, settings.rim)
+        glass = self._on_glass(surfaces)
+        return glass_pixels(flat, surfaces, inside, glass, first_surface=settings.first_surface, normal=settings.normal)
+
+    def _on_glass(self, surfaces: ObjectSurfaces) -> Tensor:
+        """(H, W) bool: the mesh's first surface is one of the object's, not a lid or a label."""
+        return surfaces.hit & self._glass[surfaces.triangle.clamp_min(0).long()]
 
     def transmit(self, glass: GlassPixels, rays: GlassRays, step: int, options: RenderOptions | None) -> Transmission:
         """C_t of the traced pixels: what the first bounce meets, and behind the object the second."""
@@ -274,7 +145,7 @@ class TransmissiveMethod(ReflectiveMethod):
     def _own_degree(self, step: int) -> int:
         """SH degree of the transmittance set: grown on its own clock, but never below what it came with."""
         assert self.transmittance is not None
-        largest = self.transmittance.surfels.sh_degree
+        largest = min(self.transmittance.surfels.sh_degree, self.settings.transmittance.sh_degree)
         if self._from_base:
             return min(self.sh_degree(step), largest)
         return sh_degree_at(self.through.own, self.through.clock(step), largest)
@@ -319,16 +190,13 @@ class TransmissiveMethod(ReflectiveMethod):
         return found
 
     def _interface_normal(self, rendered: RenderedView) -> Tensor:
-        """Mean over all pixels of 1 - n . N where the object is seen; n rasterised, N of the mesh."""
+        """1 - n . N where the object is seen; n rasterised, N of the mesh."""
         assert self.guide is not None
         surfaces = self.guide.surfaces(rendered.camera)
         assert rendered.transparent is not None
-        where = (rendered.transparent & surfaces.hit).flatten().nonzero()[:, 0]
         assert rendered.buffers.normal is not None
-        normal = rendered.buffers.normal.flatten(1)[:, where]
-        unit = normal * normal.square().sum(0).clamp_min(SHORTEST_NORMAL**2).rsqrt()
-        cosine = (unit * surfaces.normal.flatten(1)[:, where]).sum(0)
-        return (1 - cosine).sum() / surfaces.hit.numel()
+        where = rendered.transparent & self._on_glass(surfaces)
+        return mesh_normal_loss(rendered.buffers.normal, surfaces.normal, where)
 
     # ---- between steps
 
@@ -351,27 +219,3 @@ class TransmissiveMethod(ReflectiveMethod):
         if self.transmittance.density.resets_opacity and opacity_reset_due(own, clock + 1):
             events.append(self.reset_opacity(self.transmittance, settings.reset_opacity))
         return tuple(events)
-
-    # ---- state
-
-    def state(self) -> dict[str, Tensor]:
-        begun = {_BEGUN: torch.tensor([self._from_base], dtype=torch.uint8)} if self.transparent else {}
-        return super().state() | begun
-
-    def load(self, state: dict[str, Tensor]) -> None:
-        """Go on from :meth:`state` of any stage."""
-        self.transparent = _BEGUN in state
-        self._from_base = self.transparent and bool(state[_BEGUN])
-        own, interface = _rows(state, "transmittance", Surfels), _rows(state, "interface", MaterialSurfels)
-        self.transmittance = None if own is None else self._transmittance_set(own)
-        self.interface = None if interface is None else self._interface_set(interface)  # type: ignore[arg-type]
-        self._base_tree.clear()
-        super().load(state)
-        self._base_tree.clear()
-
-
-def _rows(state: dict[str, Tensor], name: str, kind: type[Surfels]) -> Surfels | None:
-    """The raw surfels of a set in a state; None: it is not there."""
-    names = [field.name for field in fields(kind)]
-    found = {key: state[f"{name}.surfels.{key}"] for key in names if f"{name}.surfels.{key}" in state}
-    return kind(**{key: found[key].clone() for key in names}) if found else None

@@ -31,11 +31,12 @@ def rows_inside(surfels: Surfels, mesh: ObjectMesh, margin: float) -> Tensor:
 
 
 @torch.no_grad()
-def take_out(base: SurfelSet, rows: Tensor) -> Surfels:
-    """Remove the surfels ``rows`` (N,) bool of the base set, with their moments, and return them without materials."""
+def take_out(base: SurfelSet, rows: Tensor, kept: Tensor) -> Surfels:
+    """Remove the surfels ``rows`` (N,) bool of the base set, with their moments, and return them without materials;
+    those that are ``kept`` (N,) bool are copied."""
     taken = select_rows(base.surfels, rows)
     nothing = select_rows(base.surfels, torch.zeros(0, dtype=torch.int64))
-    apply_plan(RowPlan((~rows).nonzero()[:, 0], nothing), base.surfels, base.optimizer, base.density)
+    apply_plan(RowPlan((~rows | kept).nonzero()[:, 0], nothing), base.surfels, base.optimizer, base.density)
     return without_materials(taken) if isinstance(taken, MaterialSurfels) else taken  # type: ignore[return-value]
 
 

@@ -59,6 +59,7 @@ class LossSettings:
     normal_inverse_depth: bool = False  # EnvGS: weight by 1 - (d - p1)/(p99 - p1), clipped, detached
     mono_normal: float = 0.0  # RT-GS 0.01; only where the scene has normals
     mono_normal_gain: float = 1.0  # its weight is multiplied by it: short presets (docs/reflection.md), 1 = published
+    mono_normal_masked: float = 1.0  # times that again in masks of transparent objects (docs/transmittance.md)
     mono_normal_start: float = 0.0  # EnvGS: from 0
     mono_normal_form: str = "cosine"  # "cosine" (paper: 1 - n.N) or "envgs" (|difference|_1 + 1 - cos)
     distortion: float = 0.0  # 2DGS: 0 unbounded, 1000 bounded
@@ -293,6 +294,13 @@ class TransmittanceSettings:
     first_surface: str = "mesh"  # where the object's pixels have their surface; the paper: "base", the rasterised depth
     normal: str = "base"  # the rasterised normals there (of the interface, if there is one); "mesh": fixed, for tests
     max_gain: float | None = None  # S_max in the object's pixels; None: optics.max_gain
+    max_weight: float = 1.0  # largest w_r there: an S_max of 16 alone lets the rim glow and darkens the set; 0: none
+    rim: int = 2  # pixels around the object's that get straight rays too: interface surfels reach over its outline
+    # Share of the masked pixels whose base depth is the object's first surface; with more the object is opaque and the
+    # stage left out (docs/transmittance.md: thin glass 0.05 to 0.5). 1: never.
+    opaque_share: float = 0.9
+    keep_seen: int = 3  # views that see a surfel bare, from which on it stays in the base set too; 0: all go
+    sh_degree: int = 3  # of the transmittance set, at most
     split: bool = True  # base surfels inside the mesh become the transmittance set; the paper: a random set (False)
     split_margin: float = 1.0  # voxels outside the mesh that still count as inside
     box: str = "object"  # row 16, of a random set; "scene": the paper

@@ -115,11 +115,14 @@ class InterfaceSettings:
     floor: float = 0.9  # opacities stay at or above it: photometric training erodes glass; no resets here
     scale: float = 1.0  # times the distance to the neighbours
     specular: float = 0.9  # initial k_s: L_spec's target
-    # With both and transmittance.max_gain 16, w_r starts near 0.8: bright reflections form within a short run.
-    f0: float = 0.15  # initial; against 0.04: docs/transmittance.md
+    # With both and transmittance.max_gain 16, w_r starts near 0.8, bounded by transmittance.max_weight; f0 0.05 starts
+    # near 0.25 and ends as well (docs/transmittance.md).
+    f0: float = 0.15  # initial
     roughness: float = 0.005  # initial
     normal_loss: float = 0.2  # weight of 1 - n . N of the mesh in the masks: 0.01 does nothing there, 0.05 harms
     normal_loss_until: float = 1.0  # share of the run; afterwards only reflections move the normals
+    masked_share: float = 0.5  # of the views in which a point of the mesh is the first surface: masked there in fewer
+    # than this share, it is no glass (a label, the lid that a hull puts on a cup) and gets no surfels
 
     def __post_init__(self) -> None:
         refuse_bad_numbers(self, "method.transmittance.interface")

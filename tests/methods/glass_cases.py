@@ -108,6 +108,8 @@ def glass_recipe(**changes) -> MethodSettings:
         densify_every=8,
         opacity_reset_every=20,
         sh_every=10,
+        rim=0,  # of a 24x18 picture 2 pixels are much
+        keep_seen=0,
         interface=InterfaceSettings(count=150),
         density=DensitySettings(gradient_threshold=1e-6, max_surfels=600, min_opacity=0.005),
         init=InitSettings(scale=0.5),

@@ -46,7 +46,8 @@ class GlassTwin:
         assert self.method.guide is not None
         surfaces = self.method.guide.surfaces(self.camera)
         flat, covered = self._surface()
-        inside, known = inside.flatten(), inside.flatten() & surfaces.hit.flatten()
+        inside, met = inside.flatten(), inside.flatten() & surfaces.hit.flatten()
+        known = met & self.method._glass[surfaces.triangle.flatten().clamp_min(0).long()]
         if self.settings.first_surface == "mesh":
             flat = replace(flat, depth=torch.where(known, surfaces.near.flatten().double(), flat.depth))
         covered &= flat.depth > 0
@@ -59,10 +60,19 @@ class GlassTwin:
         reflected = self._trace("reflection", mirrored.origins, mirrored.directions, options, everyone)
         weights = pixel_weights(mirrored.cosine, flat, self.method.settings.optics)
         assert reflected.colors is not None
-        light = weights.reflection * reflected.colors.T
+        optics, gain = self.method.settings.optics, self.settings.max_gain
+        own = pixel_weights(
+            mirrored.cosine, flat, optics if gain is None else replace(optics, max_gain=gain)
+        ).reflection
+        if self.settings.max_weight > 0:
+            near_bound = (own - self.settings.max_weight).abs() < 1e-4
+            self.fragile |= inside & (near_bound if near_bound.ndim == 1 else near_bound.any(0))
+            own = own.clamp_max(self.settings.max_weight)
+        reflection = torch.where(inside, own, weights.reflection)
+        light = reflection * reflected.colors.T
         rows = (inside & covered).nonzero()[:, 0]
         near = flat.depth.detach()[rows]
-        second = (surfaces.second.flatten() & known)[rows]
+        second = (surfaces.second.flatten() & met)[rows]
         far = torch.where(second, torch.maximum(surfaces.far.flatten().double()[rows], near), near)
         color, first = self._through(rays.origin, view[:, rows].T, near, far, second, rows)
         light = light + weights.transmission * torch.zeros_like(light).index_copy(1, rows, color.T)

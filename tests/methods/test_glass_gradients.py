@@ -19,6 +19,7 @@ CASES: dict[str, dict[str, object]] = {
     "sum, clipped, no gradient": {"compositing": "sum", "first_bounce_end": "clip", "second_bounce_gradient": False},
     "no mesh guide": {"second_bounce": "first_bounce"},
     "base set inside": {"first_bounce": "base"},
+    "bounded weight, rim": {"max_gain": 16.0, "max_weight": 0.3, "rim": 1, "sh_degree": 1},
 }
 
 
@@ -35,8 +36,12 @@ def test_image_and_every_gradient_are_those_of_the_twins(case: str):
     view = made.scene.train[0]
     assert view.mask is not None
     twin_sets = {part.name: doubled(part.surfels) for part in method.sets}  # type: ignore[arg-type]
-    twin = GlassTwin(method, twin_sets, view.camera, STEP).render(view.mask)
     rendered = method.render(view.camera, STEP, None, view.mask)
+    assert rendered.transparent is not None
+    grown = settings.transmittance.rim > 0
+    assert bool((rendered.transparent & ~view.mask).any()) == grown
+    assert not bool((view.mask & ~rendered.transparent).any())
+    twin = GlassTwin(method, twin_sets, view.camera, STEP).render(rendered.transparent)
     clear = ~twin.fragile
     assert float(clear.double().mean()) > 0.3
     assert int((clear & view.mask).sum()) > 20

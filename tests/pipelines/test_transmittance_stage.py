@@ -49,7 +49,7 @@ def pose(index: int) -> list[list[float]]:
 
 
 def write_capture(folder: Path, masks: str) -> Path:
-    """Pictures of a ball; ``masks``: "ball", "empty" or "none"."""
+    """Pictures of a ball; ``masks``: "ball", "empty", "full" or "none"."""
     (folder / "images").mkdir(parents=True)
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH]
     apparent = FOCAL * RADIUS / math.sqrt(DISTANCE**2 - RADIUS**2)
@@ -61,7 +61,7 @@ def write_capture(folder: Path, masks: str) -> Path:
         Image.fromarray(picture.clip(0, 255).astype(np.uint8)).save(folder / "images" / f"{index:03d}.png")
         if masks != "none":
             (folder / "masks").mkdir(exist_ok=True)
-            mask = (ball if masks == "ball" else np.zeros_like(ball)).astype(np.uint8) * 255
+            mask = (ball if masks == "ball" else np.full_like(ball, masks == "full")).astype(np.uint8) * 255
             Image.fromarray(mask).save(folder / "masks" / f"{index:03d}.png")
         frames.append({"file_path": f"images/{index:03d}.png", "transform_matrix": pose(index)})
     shared = {"w": WIDTH, "h": HEIGHT, "fl_x": FOCAL, "fl_y": FOCAL, "cx": 16.0, "cy": 12.0, "camera_model": "PINHOLE"}
@@ -85,7 +85,11 @@ def test_only_scenes_with_masks_that_show_something_get_the_third_stage(glass: P
     assert full.mesh is not None
     assert [step.name for step in full.mesh.upstream] == ["import_scene", "train_diffuse", "train_reflection"]
     assert full.mesh in full.training[-1].upstream
-    for masks, why in (("none", "no masks of transparent objects"), ("empty", "all 14 masks of the scene are empty")):
+    for masks, why in (
+        ("none", "no masks of transparent objects"),
+        ("empty", "all 14 masks of the scene are empty"),
+        ("full", "14 of 14 masks cover the whole picture"),
+    ):
         without = graph_of(write_capture(tmp_path / masks, masks))
         assert [step.name for step in without.training] == ["train_diffuse", "train_reflection"]
         assert without.mesh is None

@@ -1,0 +1,91 @@
+"""What the training views tell of a transparent object beside its outline: which part of its mesh is glass, which base
+surfels are seen bare, whether one sees into it at all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rtgs.cameras import Camera
+from rtgs.mesh.container import ObjectGuide
+from rtgs.mesh.silhouettes import bounding
+
+if TYPE_CHECKING:
+    from rtgs.scenes.scene import View
+
+Depths = Callable[[Camera], Tensor]
+"""From a camera to the (H, W) z-depth of what is opaque there, 0 where nothing is."""
+
+_ON_SURFACE = 0.02  # of the depth: a surfel so near to a pixel's depth is what the pixel shows
+_AT_FRONT = 0.15  # of the view's median thickness: what lies deeper is seen through the surface
+_ROUNDS = 3  # of neighbouring faces that vote together
+
+
+def masked_views(views: Iterable[View]) -> Iterator[tuple[View, Tensor]]:
+    """The views whose mask tells something, with it."""
+    return ((view, mask) for view in views if (mask := bounding(view.mask)) is not None)
+
+
+def glass_faces(guide: ObjectGuide, views: Iterable[View], least: float) -> Tensor:
+    """(F,) bool: faces of the object's mesh that are masked in at least the share ``least`` of the pixels whose first
+    surface on the mesh they are; those that no view shows count as glass.
+
+    A mask shows where the first surface is transparent. It is missing where a label covers the glass, and mostly so on
+    the lid that a hull puts on an open cup.
+    """
+    faces = guide.mesh.mesh.faces.astype(np.int64)
+    if least == 0:
+        return torch.ones(len(faces), dtype=torch.bool)
+    seen, masked = np.zeros(len(faces)), np.zeros(len(faces))
+    for view, mask in masked_views(views):
+        surfaces = guide.surfaces(view.camera)
+        triangle, inside = surfaces.triangle[surfaces.hit].numpy(), mask[surfaces.hit].numpy()
+        seen += np.bincount(triangle, minlength=len(faces))
+        masked += np.bincount(triangle[inside], minlength=len(faces))
+    for _ in range(_ROUNDS):
+        seen, masked = (_spread(votes, faces, len(guide.mesh.mesh.vertices)) for votes in (seen, masked))
+    return torch.from_numpy(masked >= least * seen)
+
+
+def _spread(votes: np.ndarray, faces: np.ndarray, vertices: int) -> np.ndarray:
+    """(F,) the votes of every face and of those that share a vertex with it."""
+    at_vertex = np.bincount(faces.reshape(-1), weights=votes.repeat(3), minlength=vertices)
+    return at_vertex[faces].sum(1)
+
+
+def seen_bare(points: Tensor, views: Iterable[View], depths: Depths) -> Tensor:
+    """(N,) int64: in how many views a point (N, 3) lies on the opaque surface of a pixel that is not masked."""
+    counts = torch.zeros(len(points), dtype=torch.int64)
+    for view, mask in masked_views(views):
+        index, depth, framed = _pixels(view.camera, points)
+        surface = depths(view.camera).reshape(-1)[index]
+        counts += framed & ~mask.reshape(-1)[index] & ((depth - surface).abs() < _ON_SURFACE * surface)
+    return counts
+
+
+def _pixels(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Of points (N, 3): (N,) int64 pixel in the flattened picture, (N,) float32 z-depth, (N,) bool in the picture (the
+    pixel of the others is 0)."""
+    pixels, depth = camera.project(points.double())
+    column, row = pixels[:, 0].floor(), pixels[:, 1].floor()
+    framed = (depth > 0) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+    return torch.where(framed, row * camera.width + column, 0.0).long(), depth.float(), framed
+
+
+def on_surface(guide: ObjectGuide, views: Iterable[View], depths: Depths) -> float | None:
+    """Share of the masked pixels with two surfaces whose opaque surface is the object's first one: near 1 for an opaque
+    thing, which has nothing behind its surface. None: no such pixel."""
+    on = count = 0
+    for view, mask in masked_views(views):
+        surfaces = guide.surfaces(view.camera)
+        chosen = mask & surfaces.second
+        if not chosen.any():
+            continue
+        near, far = surfaces.near[chosen], surfaces.far[chosen]
+        on += int(((depths(view.camera)[chosen] - near).abs() < _AT_FRONT * (far - near).median()).sum())
+        count += len(near)
+    return on / count if count else None

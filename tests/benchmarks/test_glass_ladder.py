@@ -1,0 +1,69 @@
+"""The ladder of knowledge about a transparent object: its files, one rung at the smallest size, its pixels."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from benchmarks import glass_ladder
+from benchmarks.glass_ladder import BRIGHT, RUNGS, base_config, bright_pixels, prepare
+
+TINY = (
+    *("scene.long_side=48", "schedule.total=12", "schedule.checkpoint_every=12", "method.density.max_surfels=800"),
+    *("method.reflection.cells=3", "method.transmittance.interface.count=100", "method.loss.perceptual=0"),
+)
+
+
+def options(tmp_path: Path) -> SimpleNamespace:
+    return SimpleNamespace(preset="smoke", set=list(TINY), root=tmp_path)
+
+
+def test_every_rung_is_another_recipe_of_the_same_scene(tmp_path: Path):
+    setting = prepare("ball_statue", options(tmp_path))  # type: ignore[arg-type]
+    split = json.loads(setting.split.read_text())
+    assert len(split["train"]) == 37
+    assert not set(split["train"]) & set(split["test"])
+    assert split["test"][:5] == list(setting.held_out)
+    assert setting.truth.stat().st_size > 1000
+    config = base_config("ball_statue", options(tmp_path))  # type: ignore[arg-type]
+    words = {name: tuple(rung.words(setting, config)) for name, rung in RUNGS.items()}
+    assert len(set(words.values())) == len(RUNGS)
+    assert f"mesh.object.given={setting.truth}" in words["truth"]
+    assert "method.loss.mono_normal_masked=2" in words["paper_mono_in_mask"][-1]
+    with pytest.raises(SystemExit, match="no path-traced scene"):
+        prepare("matte_room", options(tmp_path))  # type: ignore[arg-type]
+
+
+def test_a_rung_goes_through_the_pipeline(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    words = ["--scenes", "ball_statue", "--rungs", "truth", "--preset", "smoke", "--root", str(tmp_path)]
+    monkeypatch.setattr(sys, "argv", ["glass_ladder", *words, "--set", *TINY])
+    glass_ladder.main()
+    found = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert found["failures"] == []
+    (figures,) = found["figures"]
+    assert figures["silhouette_iou"] > 0.9, "the true container fits the masks"
+    assert figures["normal_after"] > 0.1
+    assert all(figures[name] > 3 for name in ("psnr", "psnr_masked", "psnr_bright", "psnr_held_out"))
+    assert figures["seconds"] > 0
+    text = (tmp_path / "ladder-smoke.md").read_text()
+    assert text.startswith("`python -m benchmarks.glass_ladder --preset smoke --scenes ball_statue --rungs truth")
+    assert "| ball_statue | true mesh, true normals held fixed |" in text
+
+
+def test_bright_pixels_are_the_brightest_tenth_of_the_mask():
+    mask = torch.zeros(20, 30, dtype=torch.bool)
+    mask[5:15, 5:25] = True
+    light = torch.rand(3, 20, 30, generator=torch.Generator().manual_seed(0))
+    view = SimpleNamespace(mask=mask, truth=SimpleNamespace(reflected=light))
+    bright = bright_pixels(view)  # type: ignore[arg-type]
+    assert not bool((bright & ~mask).any())
+    assert float(bright.sum() / mask.sum()) == pytest.approx(1 - BRIGHT, abs=0.01)
+    means = light.mean(0)
+    assert float(means[bright].mean()) > float(means[mask].mean()) + 0.1

@@ -1,0 +1,225 @@
+"""What masks and the base set's depth tell of the object: which faces are glass, what is seen bare, whether one sees
+into it; and what the third stage makes of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from glass_cases import GlassScene, begun, glass_recipe, glass_scene, new_glass_method, train_stages
+from mirror_scene import BALL, RADIUS, ball_hit
+from reflective_cases import schedule
+from torch import Tensor
+
+from rtgs.cameras import Camera
+from rtgs.mesh.container import ObjectGuide
+from rtgs.methods import RenderOptions
+from rtgs.methods.glass import widened
+from rtgs.methods.glass_evidence import glass_faces, on_surface, seen_bare
+from rtgs.methods.interface_set import normal_quaternions
+from rtgs.methods.transmittance import TransmissiveMethod
+from rtgs.scenes.scene import View
+from rtgs.train.specular_settings import InterfaceSettings
+
+LABEL = -0.1  # of the radius: above this height the ball is covered
+VOTED = InterfaceSettings(count=150, masked_share=0.5)
+
+
+def ball_points(camera: Camera) -> tuple[Tensor, Tensor]:
+    """(H, W) bool: the pixel shows the ball, and the (H, W, 3) unit offset of the point from its middle."""
+    rays = camera.rays()
+    direction = torch.nn.functional.normalize(rays.directions.reshape(-1, 3), dim=1)
+    hit, distance = ball_hit(rays.origin.expand_as(direction), direction)
+    offset = (rays.origin + distance[:, None] * direction - BALL) / RADIUS
+    shape = (camera.height, camera.width)
+    return hit.reshape(shape), offset.reshape(*shape, 3)
+
+
+def ball_depth(camera: Camera) -> Tensor:
+    """(H, W) z-depth of the ball's front, 0 beside it."""
+    hit, offset = ball_points(camera)
+    depth = camera.to_camera((BALL + RADIUS * offset.double()).reshape(-1, 3))[:, 2]
+    return torch.where(hit, depth.reshape(hit.shape).float(), 0.0)
+
+
+def labelled(view: View) -> View:
+    """The ball's cap is opaque: not in the mask."""
+    hit, offset = ball_points(view.camera)
+    return replace(view, mask=hit & (offset[..., 2] < LABEL))
+
+
+@pytest.fixture(scope="module")
+def plain() -> GlassScene:
+    return glass_scene()
+
+
+@pytest.fixture(scope="module")
+def capped() -> GlassScene:
+    made = glass_scene(views=16, width=48, height=36)
+    return GlassScene(replace(made.scene, train=tuple(labelled(view) for view in made.scene.train)), made.mesh)
+
+
+def heights(points: Tensor) -> Tensor:
+    return (points - BALL)[:, 2] / RADIUS
+
+
+def test_faces_that_no_mask_shows_are_no_glass(capped: GlassScene):
+    guide = ObjectGuide(capped.mesh)
+    glass = glass_faces(guide, capped.scene.train, 0.5)
+    middles = torch.from_numpy(capped.mesh.mesh.vertices[capped.mesh.mesh.faces].mean(1)).float()
+    height = heights(middles)
+    assert not bool(glass[(height > LABEL + 0.3)].any())
+    assert float(glass[height < LABEL - 0.3].float().mean()) > 0.95
+    assert bool(glass_faces(guide, capped.scene.train, 0.0).all())
+    unmasked = [replace(view, mask=None) for view in capped.scene.train]
+    assert bool(glass_faces(guide, unmasked, 0.5).all()), "nobody says that it is no glass"
+
+
+def test_the_interface_leaves_out_what_is_no_glass(capped: GlassScene):
+    method = begun(glass_recipe(interface=VOTED), capped)
+    assert method.interface is not None
+    assert len(method.interface) == 150
+    points = method.interface.surfels.means.detach()
+    assert float((heights(points) > LABEL + 0.3).float().mean()) < 0.06
+    whole = begun(glass_recipe(interface=replace(VOTED, masked_share=0.0)), capped)
+    assert whole.interface is not None
+    assert float((heights(whole.interface.surfels.means.detach()) > LABEL + 0.3).float().mean()) > 0.1
+    assert method.guide is not None
+    shown = [method.guide.surfaces(view.camera) for view in capped.scene.train]
+    assert all(bool(method._on_glass(surfaces).any()) for surfaces in shown)
+    assert any(bool((surfaces.hit & ~method._on_glass(surfaces)).any()) for surfaces in shown)
+    view = capped.scene.train[0]
+    again = new_glass_method(glass_recipe(interface=VOTED), capped)
+    again.load(method.state())
+    assert torch.equal(again._glass, method._glass)
+    images = [m.render(view.camera, 40, RenderOptions(), view.mask).image for m in (method, again)]
+    assert torch.equal(*images)
+
+
+def test_points_seen_bare_lie_on_an_unmasked_surface(capped: GlassScene):
+    angle = torch.arange(12) * torch.pi / 6
+
+    def ring(height: float, radius: float = RADIUS) -> Tensor:
+        flat = (1 - height * height) ** 0.5
+        return BALL + radius * torch.stack((flat * angle.cos(), flat * angle.sin(), torch.full((12,), height)), dim=1)
+
+    covered, bare, away = (
+        seen_bare(points, capped.scene.train, ball_depth) for points in (ring(-0.4), ring(0.2), ring(0.2, 2 * RADIUS))
+    )
+    assert int(covered.max()) == 0
+    assert float((bare >= 2).float().mean()) > 0.8
+    assert int(away.max()) == 0
+
+
+def test_what_is_seen_bare_stays_in_the_base_set_too(capped: GlassScene):
+    recipe = glass_recipe(keep_seen=2, interface=VOTED)
+    method = new_glass_method(recipe, capped)
+    for stage in method.stages[:2]:
+        method.begin(stage)
+    with torch.no_grad():  # an opaque skin of the ball
+        method.base.surfels.means[:200] = BALL + RADIUS * torch.nn.functional.normalize(
+            torch.randn(200, 3, generator=torch.Generator().manual_seed(1)), dim=1
+        )
+        method.base.surfels.log_scales[:200] = torch.tensor(0.12 * RADIUS).log()
+        method.base.surfels.opacity_logits[:200] = 4.0
+    before = len(method.base)
+    method.settings = replace(recipe, transmittance=replace(recipe.transmittance, opaque_share=1.0))
+    events = method.begin(method.stages[2])
+    assert method.transmittance is not None
+    both = len(method.base) + len(method.transmittance) - before
+    assert 10 < both < 150
+    assert any(f"{both} of them seen bare too" in event.detail for event in events)
+    view = capped.scene.train[0]
+    with torch.no_grad():
+        method.render(view.camera, 31, None, view.mask)
+    train_stages(new_glass_method(recipe, capped, schedule(total=24, checkpoint_every=100)), capped.scene)
+
+
+def test_an_opaque_thing_under_masks_is_left_alone(plain: GlassScene):
+    guide = ObjectGuide(plain.mesh)
+    views = plain.scene.train
+    assert on_surface(guide, views, ball_depth) == pytest.approx(1.0, abs=0.05)
+    assert on_surface(guide, views, lambda camera: ball_depth(camera) + RADIUS) == pytest.approx(0.0, abs=0.05)
+    assert on_surface(guide, [replace(view, mask=None) for view in views], ball_depth) is None
+    method = _with_skin(plain)
+    (event,) = method.begin(method.stages[2])
+    assert "left out: the masked object looks opaque" in event.detail
+    assert [part.name for part in method.sets] == ["base", "reflection"]
+    assert method.decisions[-1].what == "no transmittance stage"
+    view = views[0]
+    rendered = method.render(view.camera, 40, None, view.mask)
+    assert rendered.transparent is None
+    assert "specular" not in {term.name for term in method.losses(rendered, view, 40).terms}
+    again = new_glass_method(glass_recipe(), plain)
+    again.load(method.state())
+    assert again.decisions[-1] == method.decisions[-1]
+    assert again.glass_mask(view) is None
+
+
+def _with_skin(made: GlassScene) -> TransmissiveMethod:
+    """Before its third stage, with an opaque ball in the place of the glass one."""
+    method = new_glass_method(glass_recipe(), made)
+    for stage in method.stages[:2]:
+        method.begin(stage)
+    count = len(method.base)
+    with torch.no_grad():
+        around = torch.nn.functional.normalize(torch.randn(count, 3, generator=torch.Generator().manual_seed(1)), dim=1)
+        method.base.surfels.means.copy_(BALL + RADIUS * around)
+        method.base.surfels.quaternions.copy_(normal_quaternions(around))
+        method.base.surfels.log_scales.fill_(torch.tensor(0.2 * RADIUS).log())
+        method.base.surfels.opacity_logits.fill_(5.0)
+    return method
+
+
+def test_a_mask_of_the_whole_picture_is_none(plain: GlassScene):
+    method = begun(glass_recipe(), plain)
+    view = plain.scene.train[0]
+    covered = replace(view, mask=torch.ones(view.camera.height, view.camera.width, dtype=torch.bool))
+    assert method.glass_mask(covered) is None
+    assert method.glass_mask(view) is view.mask
+    assert method.guide is not None
+    shown = method.render(view.camera, 40, None, covered.mask).transparent
+    assert shown is not None
+    assert torch.equal(shown, method.guide.surfaces(view.camera).hit)
+    everywhere = GlassScene(replace(plain.scene, train=(covered,) * 4), plain.mesh)
+    assert begun(glass_recipe(), everywhere).decisions[-1].why.startswith("the masks of the training views are empty")
+
+
+def test_one_masked_view_is_enough_to_train(plain: GlassScene):
+    first, *others = plain.scene.train
+    one = GlassScene(replace(plain.scene, train=(first, *(replace(view, mask=None) for view in others))), plain.mesh)
+    method = new_glass_method(glass_recipe(interface=VOTED, keep_seen=3), one, schedule(total=24, checkpoint_every=100))
+    train_stages(method, one.scene)
+    assert method.transparent
+    for part in method.sets:
+        assert all(bool(torch.isfinite(tensor).all()) for _, tensor in part.surfels.items())
+
+
+def test_widened_masks():
+    inside = torch.zeros(5, 7, dtype=torch.bool)
+    inside[2, 3] = True
+    assert torch.equal(widened(inside, 0), inside)
+    grown = widened(inside, 1)
+    assert int(grown.sum()) == 9
+    assert bool(grown[1:4, 2:5].all())
+
+
+def test_monocular_normals_may_count_more_on_the_object(plain: GlassScene):
+    view = plain.scene.train[0]
+    assert view.mask is not None
+    normal = torch.zeros(3, view.camera.height, view.camera.width)
+    normal[2] = -1.0
+    view = replace(view, normal=normal)
+    scene = replace(plain.scene, train=(view, *plain.scene.train[1:]))
+    values = []
+    for share in (1.0, 3.0):
+        recipe = glass_recipe()
+        recipe = replace(recipe, loss=replace(recipe.loss, mono_normal=0.1, mono_normal_masked=share))
+        method = new_glass_method(recipe, GlassScene(scene, plain.mesh))
+        terms = method.losses(method.render(view.camera, 5), view, 5).terms
+        values.append(next(term.value for term in terms if term.name == "mono_normal"))
+    outside = replace(view, mask=torch.zeros_like(view.mask))
+    terms = method.losses(method.render(view.camera, 5), outside, 5).terms
+    assert next(term.value for term in terms if term.name == "mono_normal") == pytest.approx(values[0], rel=1e-5)
+    assert values[0] < values[1] < 3 * values[0]
