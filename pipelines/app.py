@@ -100,7 +100,7 @@ def _tracked(
     from pipelines.results import run_info, track_end, track_start, write_run_folder
 
     with tracking.run(run_info(config, choices, plan, parent)) as tracker:
-        track_start(tracker, config, plan)
+        track_start(tracker, config, choices, plan)
         results = InlineExecutor(stores.local, tracking, stores.remote).execute(plan)
         folder = write_run_folder(config, choices, command, results)
         track_end(tracker, folder, results)

@@ -9,6 +9,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from filelock import FileLock
@@ -20,7 +21,6 @@ from pipelines.training import read_history, stage_params
 from rtgs.config.schema import Choices, RunConfig
 from rtgs.errors import RtgsError
 from rtgs.pipeline import Plan, StepResult, Store
-from rtgs.pipeline.fingerprint import flatten
 from rtgs.prepare.masks_report import FILES as MASK_FILES
 from rtgs.prepare.quality import PICTURE_FILE, REPORT_FILE
 from rtgs.track import RunInfo, Tracker
@@ -31,7 +31,9 @@ if TYPE_CHECKING:
     from rtgs.evaluate.evaluate import EvaluationTable
 
 RUN_FILE = "run.json"
+CONFIG_FILE = "config.yaml"
 _TRACKED_IMAGES = 4
+_NOT_TOLD = ("paths.", "tracking.", "table.")  # where results go, not what they are
 
 
 @dataclass(frozen=True)
@@ -92,7 +94,7 @@ def _fill_run_folder(
         shutil.copyfile(places["sfm"] / name, folder / name)
     for name in MASK_FILES if "masks" in places else ():
         shutil.copyfile(places["masks"] / name, folder / name)
-    (folder / "config.yaml").write_text(config_yaml(config), encoding="utf-8")
+    (folder / CONFIG_FILE).write_text(config_yaml(config), encoding="utf-8")
     finished = datetime.now(UTC).isoformat(timespec="seconds")
     record = RunRecord(str(config.name), command, finished, asdict(choices), steps)
     (folder / RUN_FILE).write_text(json.dumps(asdict(record), indent=1) + "\n", encoding="utf-8")
@@ -170,12 +172,29 @@ def run_info(config: RunConfig, choices: Choices, plan: Plan, parent: str = "") 
     return RunInfo(config.tracking.experiment, str(config.name), target.fingerprint, tags, parent)
 
 
-def track_start(tracker: Tracker, config: RunConfig, plan: Plan) -> None:
-    """Parameters and the plan."""
-    values = flatten(asdict(config))
-    hidden = ("paths.", "tracking.", "method.paper_schedule.")
-    tracker.params({key: _scalar(value) for key, value in values.items() if not key.startswith(hidden)})
+def track_start(tracker: Tracker, config: RunConfig, choices: Choices, plan: Plan) -> None:
+    """What a person tells runs apart by as parameters; the whole config as ``config.yaml``, and the plan."""
+    tracker.params(told_apart(config, choices))
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / CONFIG_FILE
+        path.write_text(config_yaml(config), encoding="utf-8")
+        tracker.artifact(path)
     tracker.table("plan", plan_rows(plan))
+
+
+def told_apart(config: RunConfig, choices: Choices) -> dict[str, str]:
+    """The chosen names, the seed and the overrides, by key.
+
+    Not the hundreds of other keys: trackers print all parameters above every picture. What a step read is with the
+    step's own run.
+    """
+    names = ("scene", "method", "preset", "ablation")
+    told = {name: str(getattr(choices, name)) for name in names} | {"seed": str(config.seed)}
+    for word in choices.overrides:
+        key, _, value = word.lstrip("+~").partition("=")
+        if not key.startswith(_NOT_TOLD):
+            told.setdefault(key, value)
+    return told
 
 
 def track_end(tracker: Tracker, folder: Path, results: Sequence[StepResult]) -> None:
@@ -198,7 +217,7 @@ def track_end(tracker: Tracker, folder: Path, results: Sequence[StepResult]) -> 
     for path in sorted((folder / "renders").glob("*.png"))[:_TRACKED_IMAGES]:
         _track_png(tracker, f"renders/{path.stem}", path)
         _track_png(tracker, f"errors/{path.stem}", folder / "errors" / path.name)
-    for name in (PAGE, TABLE_JSON, TABLE_CSV, "config.yaml", RUN_FILE, "point_cloud.ply"):
+    for name in (PAGE, TABLE_JSON, TABLE_CSV, RUN_FILE, "point_cloud.ply"):
         if (folder / name).is_file():
             tracker.artifact(folder / name)
 
@@ -239,10 +258,6 @@ def plan_rows(plan: Plan, skipped: Sequence[SkippedStep] = ()) -> list[Mapping[s
         }
         for planned in plan
     ]
-
-
-def _scalar(value: object) -> str | int | float | bool | None:
-    return value if value is None or isinstance(value, (str, int, float, bool)) else str(value)
 
 
 def report_page(folder: Path, store: Store) -> Path:

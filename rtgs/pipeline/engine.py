@@ -197,6 +197,7 @@ def _cluster(settings: EngineSettings) -> Any:
         from distributed import SSHCluster
 
         nanny = {"nthreads": 1, "n_workers": 1, "memory_limit": settings.memory}
+        nanny["env"] = dict(worker_environment(threads))
         scheduler = {"dashboard": bool(settings.dashboard)}
         return SSHCluster(list(settings.hosts), worker_options=nanny, scheduler_options=scheduler)
     return _slurm(settings, threads)

@@ -170,7 +170,7 @@ def test_a_mesh_on_request(words, first, root):
     assert len(list(Store(root / "store").artifacts("train_diffuse"))) == trained
 
 
-def test_an_executed_run_is_tracked_with_its_steps(words, root):
+def test_an_executed_run_is_tracked_with_its_steps(words, first, root):
     assert main([*words, "tracking=jsonl", "seed=7"]) == 0
     runs = {}
     for path in (root / "tracking").rglob("events.jsonl"):
@@ -186,6 +186,21 @@ def test_an_executed_run_is_tracked_with_its_steps(words, root):
     assert metrics["train/loss"] == 12
     assert metrics["eval/psnr"] is None
     assert (folder / "artifacts" / "report.html").is_file()
+
+
+def test_a_tracked_run_shows_what_tells_it_apart_and_keeps_the_whole_config(words, first, root):
+    """Trackers print every parameter above every picture: only those that a person tells runs apart by."""
+    assert main([*words, "tracking=jsonl", "seed=8", "table.data=own"]) == 0
+    (path,) = (root / "tracking" / "rtgs-runs").glob("*-seed8*/events.jsonl")
+    events = [json.loads(line) for line in path.read_text().splitlines()]
+    (told,) = (event["values"] for event in events if event["kind"] == "params")
+    names = {"scene": "tiny_room", "method": "2dgs", "preset": "smoke", "ablation": "none", "seed": "8"}
+    given = {word.partition("=")[0] for word in QUICK} - {"preset", "tracking", "threads"}
+    assert told == names | {key: value for key, value in told.items() if key in given | {"scene.path"}}
+    assert told["schedule.total"] == "12"
+    config = yaml.safe_load((path.parent / "artifacts" / "config.yaml").read_text())
+    assert config == yaml.safe_load((root / "runs" / "tiny_room-2dgs-smoke-seed8" / "config.yaml").read_text())
+    assert config["method"]["loss"]["normal"] == 0.05
 
 
 def test_sweeps_share_steps_and_end_with_a_table(words, first, root, capsys):
