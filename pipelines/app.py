@@ -12,12 +12,13 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from pipelines.planning import describe, remote_store
+from pipelines.planning import describe, jobs_of_words, remote_store
 from pipelines.sweep import Sweep, current_sweep, prepared_outcomes
 from rtgs.config.compose import VERSION_BASE, choices_from
 from rtgs.config.convert import to_run_config
 from rtgs.config.locate import choices_of, conf_dir
 from rtgs.config.schema import Choices, RunConfig, register_schema
+from rtgs.config.sweep import ComposedJob
 from rtgs.errors import RtgsError
 from rtgs.pipeline import InlineExecutor, Plan, RemoteStore, StepResult, Store, make_plan
 from rtgs.track import Tracking, open_tracking
@@ -192,8 +193,10 @@ class HydraApp:
                 raise
             self.error = error
 
-    def summary(self) -> str:
-        """Table and failures of a sweep whose jobs ran in this process; empty otherwise."""
+    def summary(self, words: Sequence[str]) -> str:
+        """Table and failures of a sweep; empty for a single run. ``words``: of the command line."""
+        if not self.outcomes and not self.failures and self.error is None:
+            self.outcomes, self.failures = finished_elsewhere(words)
         if len(self.outcomes) + len(self.failures) < 2:
             return ""
         from pipelines.results import evaluation_of, result_table
@@ -216,6 +219,44 @@ class HydraApp:
         return paths
 
 
+def finished_elsewhere(words: Sequence[str]) -> tuple[list[RunOutcome], list[str]]:
+    """What the jobs of a sweep that ran in other processes (launchers joblib, submitit) left, and who left nothing.
+
+    Nothing where no sweep composes: Hydra has told why by then.
+    """
+    from hydra.errors import HydraException
+
+    try:
+        jobs, sweep = jobs_of_words(words)
+    except (RtgsError, HydraException):
+        return [], []
+    outcomes, failures = [], []
+    for job in jobs if sweep else ():
+        try:
+            outcomes.append(_left_by(job))
+        except Exception as error:  # whatever it is, the job has stopped with it
+            failures.append(f"{job.title}: {error}")
+    return outcomes, failures
+
+
+def _left_by(job: ComposedJob) -> RunOutcome:
+    from pipelines.graph import build_graph
+
+    if job.config is None or job.choices is None:
+        raise RtgsError(job.problem)
+    store = Store(job.config.paths.store)
+    plan = make_plan(build_graph(job.config, job.choices).targets, store)
+    results = tuple(
+        StepResult(planned.step, artifact.folder, artifact.manifest.duration, False)
+        for planned in plan
+        if (artifact := store.find(planned.step)) is not None
+    )
+    if len(results) < len(plan):
+        first = next(planned.step for planned in plan if not planned.hit)
+        raise RtgsError(f"did not finish ({first.label} is missing); its own log says why: outputs/sweeps/")
+    return RunOutcome(job.config, plan, results, job.config.paths.runs / str(job.config.name))
+
+
 def run_hydra(arguments: Sequence[str]) -> None:
     """Compose and run; raises what the job raised."""
     import hydra
@@ -232,7 +273,7 @@ def run_hydra(arguments: Sequence[str]) -> None:
         with _command_line(["rtgs run", *friendly_overrides(arguments)]):
             decorated()
     finally:
-        if text := app.summary():
+        if text := app.summary(arguments):
             print(f"\n{text}")
     if app.error is not None:
         raise app.error

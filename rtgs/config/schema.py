@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import typing
 from dataclasses import dataclass, field
 from functools import cache
@@ -17,6 +18,7 @@ from rtgs.scenes.settings import SceneSettings
 from rtgs.train.settings import MethodSettings, ScheduleSettings
 
 SCHEMA_NAME = "run_schema"
+_DOT = "__"  # in the names of twins
 
 
 @dataclass(frozen=True)
@@ -168,7 +170,17 @@ def _twin(cls: type) -> type:
         else:
             default = dataclasses.field(default_factory=_defaults(item, None))
             fields.append((item.name, hint, default))
-    return dataclasses.make_dataclass(cls.__name__, fields)
+    twin = dataclasses.make_dataclass(cls.__name__, fields)
+    twin.__module__, twin.__qualname__ = __name__, f"{cls.__module__}.{cls.__qualname__}".replace(".", _DOT)
+    return twin
+
+
+def __getattr__(name: str) -> type:
+    """Twins by their qualified name: launchers with processes of their own pickle a config with its classes."""
+    module, _, cls = name.rpartition(_DOT)
+    if not module or name.startswith("__"):
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return _twin(getattr(importlib.import_module(module.replace(_DOT, ".")), cls))
 
 
 def _defaults(item: dataclasses.Field[Any], twin: type | None) -> typing.Callable[[], Any]:

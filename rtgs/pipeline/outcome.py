@@ -18,6 +18,10 @@ class StepUnfinished(RtgsError):
         super().__init__(outcome.problem)
         self.outcome = outcome
 
+    def __reduce__(self) -> tuple[type, tuple[StepOutcome]]:
+        """Launchers bring it from other processes."""
+        return type(self), (self.outcome,)
+
 
 @dataclass(frozen=True)
 class StepOutcome:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import pickle
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -128,3 +129,16 @@ class StepFailed(RtgsError):
         super().__init__(f"step {step.label} failed: {type(error).__name__}: {text}")
         self.step = step
         self.error = error
+
+    def __reduce__(self) -> tuple[type, tuple[Step, BaseException]]:
+        """Launchers bring it from other processes."""
+        return type(self), (self.step, _portable(self.error))
+
+
+def _portable(error: BaseException) -> BaseException:
+    """``error``, or what it says where its class cannot be unpickled: that would end the launcher's whole pool."""
+    try:
+        return pickle.loads(pickle.dumps(error))
+    except Exception:
+        text = str(error)
+        return RtgsError(text) if isinstance(error, RtgsError) else RuntimeError(f"{type(error).__name__}: {text}")

@@ -2,9 +2,11 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
+import subprocess
 import sys
 from pathlib import Path
 
+import cloudpickle
 import pytest
 import yaml
 from hydra.errors import HydraException
@@ -55,6 +57,21 @@ def test_the_schema_has_the_defaults_of_the_dataclasses():
     plain = OmegaConf.to_container(OmegaConf.structured(open_schema(RunConfig)))
     assert isinstance(plain, dict)
     assert build(RunConfig, plain) == RunConfig()  # pyright: ignore[reportArgumentType]
+
+
+def test_the_schema_goes_to_other_processes_by_name():
+    """Launchers such as joblib's pickle the composed config; a copied class would not know its own defaults."""
+    code = (
+        "import sys, pickle; from omegaconf import OmegaConf\n"
+        "config = pickle.load(sys.stdin.buffer)\n"
+        "print(OmegaConf.structured(OmegaConf.get_type(config.scene)).split_every, config.seed)"
+    )
+    config = OmegaConf.structured(open_schema(RunConfig))
+    config.seed = 3
+    done = subprocess.run([sys.executable, "-c", code], input=cloudpickle.dumps(config), capture_output=True)
+    assert done.stdout.decode().split() == [str(RunConfig().scene.split_every), "3"], done.stderr.decode()
+    with pytest.raises(AttributeError, match="no_such"):
+        _ = sys.modules[open_schema.__module__].no_such
 
 
 def test_the_command_line_wins_over_files_and_preset():

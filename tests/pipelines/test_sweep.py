@@ -138,6 +138,19 @@ def test_a_job_that_does_not_compose_leaves_the_others_alone(capture, tmp_path, 
     assert (tmp_path / "runs" / "row-2dgs-smoke" / "report.html").is_file()
 
 
+def test_a_stock_launcher_with_its_own_processes_ends_the_same_way(capture, tmp_path, capsys):
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="no hydra-joblib-launcher here (extra dev)")
+    words = ["run", "--multirun", f"scene={capture}", *(word for word in QUICK if not word.startswith("hydra"))]
+    words += ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "threads=1", "tracking=off", "table.name=mine"]
+    assert main([*words, "schedule.densify_every=0,5"]) == 1
+    captured = capsys.readouterr()
+    assert "1 of 2 jobs failed" in captured.out
+    assert "did not finish (train_diffuse" in captured.out
+    assert "schedule.densify_every is 0" in captured.err  # the job's own error
+    assert (tmp_path / "runs" / "row-2dgs-smoke" / "report.html").is_file()
+    assert "2dgs" in (tmp_path / "tables" / "mine-smoke" / "table.md").read_text()
+
+
 @pytest.mark.parametrize(
     ("override", "expected"),
     [
