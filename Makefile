@@ -21,7 +21,7 @@ SCENES_ref_real := scene=ref_real/sedan,ref_real/gardenspheres,ref_real/toycar
 SCENES_nu_nerf := scene=nu_nerf/ballstatue,nu_nerf/popcorncup,nu_nerf/real_bottle,nu_nerf/tall_bottle
 # with the papers' data: what is missing is listed with where it belongs, and nothing starts, unless RUN names the scenes
 SOME_SCENES = $(findstring scene=,$(RUN))
-CHECK_DATA = $(if $(filter-out stand_in,$(DATA)),$(if $(SOME_SCENES),,$(BIN)/rtgs check data=$(DATA)))
+CHECK_DATA = $(if $(filter-out stand_in,$(DATA)),$(if $(SOME_SCENES),,$(BIN)/rtgs check data=$(DATA) $(SCENES_$(DATA))))
 DATA_WORDS = $(if $(SOME_SCENES),,$(SCENES_$(DATA))) $(if $(filter-out stand_in,$(DATA)),table.data=paper)
 TABLE = $(BIN)/rtgs run preset=$(PRESET) $(SEED_LIST) hydra.launcher.workers=$(WORKERS) $(DATA_WORDS)
 
@@ -56,15 +56,18 @@ reproduce-table2: setup ## thin glass: the same for Table 2
 	$(CHECK_DATA)
 	$(TABLE) experiment=table2 $(RUN)
 
-reproduce-table3: SCENES_nu_nerf := scene=nu_nerf/ballstatue table.data=paper
+reproduce-table3: SCENES_nu_nerf := scene=nu_nerf/ballstatue
 reproduce-table3: setup ## what each part of the third stage is worth
+	$(CHECK_DATA)
 	$(TABLE) experiment=table3 $(RUN)
 
+reproduce-fig-split-sum: SCENES_ref_real := scene=ref_real/sedan
 reproduce-fig-split-sum: setup ## microfacet weight against split-sum shading
+	$(CHECK_DATA)
 	$(TABLE) experiment=fig_split_sum $(RUN)
 
 test: setup ## the tests
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
 
 e2e: setup ## long end-to-end runs
 	$(BIN)/python -m pytest -m slow

@@ -142,7 +142,7 @@ def cache(words: list[str]) -> int:
 def check(words: list[str]) -> int:
     """``rtgs check``: everything wrong with a capture; exit code 1 when it cannot be trained on."""
     if not words or words[0] in ("-h", "--help"):
-        print("rtgs check FOLDER | scene=NAME [scene.key=value] | data=ref_real | data=nu_nerf\n")
+        print("rtgs check FOLDER | scene=NAME [scene.key=value] | data=ref_real|nu_nerf [scene=NAME,...]\n")
         print(
             "Lists what is wrong with a capture; reads every photo, mask and normal map. data: which scenes of a paper"
         )
@@ -151,7 +151,10 @@ def check(words: list[str]) -> int:
     if words[0].startswith("data="):
         from pipelines.datasets import check_dataset
 
-        return check_dataset(words[0].removeprefix("data="))
+        if unknown := [word for word in words[1:] if not word.startswith("scene=")]:
+            raise RtgsError(f"rtgs check data=...: {unknown[0]!r} is not understood; only scene=NAME,... may follow")
+        only = [name for word in words[1:] for name in word.removeprefix("scene=").split(",")]
+        return check_dataset(words[0].removeprefix("data="), only)
     from pipelines.app import friendly_overrides
     from rtgs.config import compose
     from rtgs.prepare.source import check_source

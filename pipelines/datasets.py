@@ -6,6 +6,7 @@ The layouts are those of ``conf/scene/<dataset>/*.yaml`` (methods.md 8.1, 8.2); 
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -46,15 +47,18 @@ class SceneState:
         return not self.missing
 
 
-def dataset_states(name: str) -> tuple[SceneState, ...]:
-    """Every scene of a dataset.
+def dataset_states(name: str, only: Sequence[str] = ()) -> tuple[SceneState, ...]:
+    """Every scene of a dataset, or those of them that are named.
 
     Raises:
-        RtgsError: no dataset of this name.
+        RtgsError: no dataset of this name, or no such scene in it.
     """
-    scenes = [choice for choice in choices_of("scene") if choice.startswith(f"{name}/")]
-    if name not in TITLES or not scenes:
+    known = [choice for choice in choices_of("scene") if choice.startswith(f"{name}/")]
+    if name not in TITLES or not known:
         raise RtgsError(f"data={name!r} is no dataset: choose one of {', '.join(TITLES)}")
+    if unknown := [choice for choice in only if choice not in known]:
+        raise RtgsError(f"scene={unknown[0]} is none of data={name}: choose among {', '.join(known)}")
+    scenes = list(only) or known
     jobs, _ = compose_jobs([f"scene={','.join(scenes)}"], multirun=True)
     return tuple(_state(choice, job.config.scene) for choice, job in zip(scenes, jobs) if job.config is not None)
 
@@ -102,13 +106,13 @@ def _mask_remarks(root: Path, scene: SceneSettings) -> list[str]:
     return [f"without {root / scene.masks_dir}/, no figures inside the mask"]
 
 
-def check_dataset(name: str) -> int:
-    """Print what is there and what is missing; 0 when every scene can be trained on.
+def check_dataset(name: str, only: Sequence[str] = ()) -> int:
+    """Print what is there and what is missing; 0 when every scene, or every one of those named, can be trained on.
 
     Raises:
-        RtgsError: no dataset of this name.
+        RtgsError: no dataset of this name, or no such scene in it.
     """
-    states = dataset_states(name)
+    states = dataset_states(name, only)
     print(f"{TITLES[name]} in {os.environ.get('DATA_ROOT', 'data')} (DATA_ROOT):")
     for state in states:
         print(f"{state.choice}: {f'ready, {state.photos} photos' if state.ready else 'not ready; missing:'}")

@@ -160,6 +160,7 @@ def open_client(settings: EngineSettings) -> Iterator[Client]:
         from distributed import Client
     except ImportError as error:
         raise RtgsError("hydra/launcher=rtgs_dask needs Dask: pip install 'rtgs[cluster]'") from error
+    logging.getLogger("distributed").setLevel(logging.WARNING)  # importing it sets INFO, over what conf/hydra says
     limits = {
         "distributed.scheduler.allowed-failures": settings.retries,
         "distributed.worker.memory.terminate": False,
@@ -197,7 +198,6 @@ def _cluster(settings: EngineSettings) -> Any:
         from distributed import SSHCluster
 
         nanny = {"nthreads": 1, "n_workers": 1, "memory_limit": settings.memory}
-        nanny["env"] = dict(worker_environment(threads))
         scheduler = {"dashboard": bool(settings.dashboard)}
         return SSHCluster(list(settings.hosts), worker_options=nanny, scheduler_options=scheduler)
     return _slurm(settings, threads)

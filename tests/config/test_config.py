@@ -202,6 +202,18 @@ def test_the_whole_product_composes_and_no_ablation_is_idle():
         assert job.choices.scene
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", SCENES)
+def test_every_single_combination_composes(scene):
+    """The product itself, which the test above covers by what may touch what: method x preset x ablation of a scene."""
+    words = [f"method={','.join(choices_of('method'))}", f"preset={','.join(choices_of('preset'))}"]
+    jobs, _ = compose_jobs([f"scene={scene}", *words, f"ablation={','.join(choices_of('ablation'))}"], multirun=True)
+    assert len(jobs) == len(choices_of("method")) * len(choices_of("preset")) * len(choices_of("ablation"))
+    refused = [job.problem for job in jobs if job.config is None]
+    assert all("takes nothing away from method" in problem for problem in refused), refused
+    assert len({job.title for job in jobs if job.config}) == len(jobs) - len(refused)
+
+
 def ablation_file(name: str) -> dict:
     """What the file of an ablation says."""
     return yaml.safe_load((conf_dir() / "ablation" / f"{name}.yaml").read_text())

@@ -98,8 +98,8 @@ def test_workers_over_ssh_run_each_step_once_and_a_killed_one_is_replaced(hosts,
     plan = make_plan([counting, *toy.graph(tmp_path)], store)
 
     def attempt() -> SweepOutcomes:
-        with open_client(EngineSettings(kind="ssh", hosts=hosts, threads=1)) as client:
-            return DaskExecutor(client, WorkerJob(str(store.root), 1)).attempt(plan)
+        with open_client(EngineSettings(kind="ssh", hosts=hosts, threads=2)) as client:
+            return DaskExecutor(client, WorkerJob(str(store.root), 2)).attempt(plan)
 
     thread = threading.Thread(target=lambda: found.append(attempt()))
     thread.start()
@@ -118,7 +118,7 @@ def test_workers_over_ssh_run_each_step_once_and_a_killed_one_is_replaced(hosts,
         "train 0.2",
         "train 0.3",
     ]
-    assert (store.folder(counting) / "threads.txt").read_text() == "1 1"
+    assert (store.folder(counting) / "threads.txt").read_text() == "2 2"
 
 
 def _owner(lock_file: str) -> int:

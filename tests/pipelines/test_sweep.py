@@ -76,6 +76,7 @@ def test_a_sweep_is_one_plan_and_every_job_has_its_results(capture, tmp_path, ca
     counts = {name: len(list(store.artifacts(name))) for name in ("import_scene", "train_diffuse", "report")}
     assert counts == {"import_scene": 1, "train_diffuse": 4, "report": 4}
     assert "4 jobs, 17 steps, 0 from the cache" in captured.err
+    assert "Start Nanny" not in captured.err  # nor anything else that Dask has to say while all is well
     assert sorted(path.name for path in (tmp_path / "runs").glob("row*")) == [
         "row-2dgs-smoke",
         "row-2dgs-smoke-no_normal_loss",
