@@ -124,7 +124,7 @@ def test_the_rows_of_table_3_share_everything_before_the_third_stage(glass: Path
 
 
 def test_table_3_runs_each_shared_step_once_and_nothing_twice(root: Path, glass: Path, capsys):  # noqa: F811
-    """The paper's five rows: one first and second stage, one mesh, five third stages; our sixth adds a mesh and a stage."""
+    """The paper's five rows: one first, one second, one mesh, five third stages; our sixth: one mesh, one stage."""
     words = ["run", "experiment=table3", "hydra/launcher=basic", f"scene={glass}", *QUICK, *TINY]
     assert main(words) == 0
     store = root / "store"
