@@ -14,10 +14,11 @@ from rtgs.track.mlflow import PARENT_TAG, MlflowTracking
 
 _PAGE = 1000  # runs counted per experiment
 SWEEP_TAG = "rtgs.sweep"  # of the parent run (pipelines.sweep)
-GUIDE = """In an experiment: the table of runs (columns eval/psnr, eval/ssim; group by rtgs.method); tick some and
-Compare for curves side by side. In a run: Model metrics has the curves (train/psnr, train/loss), Artifacts > images
-the sliders (<view>/<layer>, one stop per step), tables/eval.json every test view, report.html the page,
-point_cloud.ply the model. The parent run of a sweep holds table.html."""
+GUIDE = """In an experiment: the table of runs (choose eval/psnr, eval/ssim under Columns); its chart view, the second
+button, compares figures, curves and pictures (search view_; full screen shows the runs beside each other).
+In a run: Model metrics has the curves (train/psnr, train/loss) and the sliders (<view>/<layer>, one stop per step);
+Artifacts has tables/eval.json with every test view, report.html the page, point_cloud.ply the model, config.yaml every
+key. The parent run of a sweep holds table.html."""
 
 
 def serve(root: Path, port: int) -> int:
