@@ -197,7 +197,8 @@ def _cluster(settings: EngineSettings) -> Any:
     if settings.kind == "ssh":
         from distributed import SSHCluster
 
-        nanny = {"nthreads": 1, "n_workers": 1, "memory_limit": settings.memory}
+        nanny: dict[str, Any] = {"nthreads": 1, "n_workers": 1, "memory_limit": settings.memory}
+        nanny["env"] = dict(worker_environment(threads))  # over what the host itself says
         scheduler = {"dashboard": bool(settings.dashboard)}
         return SSHCluster(list(settings.hosts), worker_options=nanny, scheduler_options=scheduler)
     return _slurm(settings, threads)

@@ -87,6 +87,7 @@ def hosts(tmp_path_factory, monkeypatch) -> Iterator[list[str]]:
         lines.append(f"UserKnownHostsFile {home / 'known_hosts'}")
         (home / "config").write_text(f"Host {' '.join(HOSTS)}\n  " + "\n  ".join(lines) + "\n")
         monkeypatch.setenv("HOME", str(home.parent))
+        monkeypatch.setenv("OMP_NUM_THREADS", "1")  # what the hosts say themselves
         monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, [str(Path(toy.__file__).parent), *sys.path])))
         yield list(HOSTS)
 
