@@ -18,7 +18,7 @@ from dataclasses import asdict, dataclass, replace
 from hashlib import sha256
 from pathlib import Path
 from re import sub
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -216,6 +216,7 @@ def score(method: Method, choice: str, seed: int, seconds: float, setting: Setti
     for view in setting.judged:
         normal, inside = setting.known[view.name][:3], setting.known[view.name][3] > 0
         seen = rendered(view)
+        assert seen.buffers.normal is not None  # asked for
         cosine = (torch.nn.functional.normalize(seen.buffers.normal, dim=0) * normal).sum(0)[inside]
         tilt = cosine.clamp(-1, 1).acos().rad2deg().median()
         parts = [psnr(seen.image, view.image, mask=mask) for mask in (inside, ~inside)]
@@ -228,7 +229,8 @@ def score(method: Method, choice: str, seed: int, seconds: float, setting: Setti
     again = [psnr(rendered(view).image, view.image, mask=setting.known[view.name][3] > 0) for view in some]
     means = torch.tensor(rows).mean(0).tolist()
     maps = torch.tensor(layers).mean(0).tolist() if layers else [None] * 6
-    return ChoiceScore(choice, seed, *means, sum(again) / len(again), *maps, seconds)
+    figures: list[Any] = [*means, sum(again) / len(again), *maps, seconds]
+    return ChoiceScore(choice, seed, *figures)
 
 
 def _layer_means(layers: SpecularLayers, inside: Tensor) -> list[float]:

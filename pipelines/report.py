@@ -107,10 +107,8 @@ def _views(table: EvaluationTable, inputs: Mapping[str, Path], count: int) -> tu
         maps = read_render(inputs["render"], name)
         photo = photos[name]
         shown = {key: maps.get(key) for key in ("depth", "normal", "alpha")}
-        truth = {"mask": photo.mask, "truth": photo.truth}
-        views.append(
-            ReportView(name, photo.camera, photo.image, maps["image"], role, layers=_layers(maps), **truth, **shown)
-        )
+        seen = (name, photo.camera, photo.image, maps["image"], role)
+        views.append(ReportView(*seen, layers=_layers(maps), mask=photo.mask, truth=photo.truth, **shown))
     return tuple(views)
 
 

@@ -116,7 +116,8 @@ class DaskExecutor:
             futures[step.fingerprint] = self.client.submit(
                 run_step, step, self.job, before, key=f"{step.name}-{step.fingerprint}", pure=False
             )
-        with plan_progress(plan, store, len(self.client.nthreads())) as tick:
+        workers: Any = self.client.nthreads()  # by address; a coroutine only where the client is asynchronous
+        with plan_progress(plan, store, len(workers)) as tick:
             for future in as_completed(futures.values()):
                 outcome = _outcome(future)
                 done[outcome.fingerprint] = outcome
