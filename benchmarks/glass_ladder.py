@@ -191,7 +191,7 @@ def read(root: Path, name: str, held_out: Sequence[str]) -> Measured:
         spent = [_summary(place)["cpu_seconds"] for place in (third, places["train_reflection"])]
         seconds = spent[0] - spent[1]
     before, after = boundary["before"], boundary["after"]
-    return Measured(
+    figures: list[Any] = [
         mean("psnr", judged=True),
         mean("psnr_masked", judged=True),
         *(mean(metric, judged=False) for metric in ("psnr", "ssim", "psnr_masked", "ssim_masked")),
@@ -202,7 +202,8 @@ def read(root: Path, name: str, held_out: Sequence[str]) -> Measured:
         after.get("normal_share"),
         before.get("silhouette_iou"),
         seconds,
-    )
+    ]
+    return Measured(*figures)
 
 
 def _summary(folder: Path) -> dict[str, Any]:

@@ -311,8 +311,8 @@ def _spread(found: _Cached, camera: Camera) -> ObjectSurfaces:
     normal[:, index] = facing * facing.square().sum(0).clamp_min(1e-12).rsqrt()
     triangle = torch.full((size,), -1, dtype=torch.int32)
     triangle[index] = found.triangle
-    maps = (hit, near, far, second)
-    return ObjectSurfaces(*(part.view(shape) for part in maps), normal.view(3, *shape), triangle.view(shape))
+    maps = (hit.view(shape), near.view(shape), far.view(shape), second.view(shape))
+    return ObjectSurfaces(*maps, normal.view(3, *shape), triangle.view(shape))
 
 
 def _camera_key(camera: Camera) -> tuple[object, ...]:
