@@ -212,7 +212,7 @@ def _summary(folder: Path) -> dict[str, Any]:
 
 def bright_psnr(places: dict[str, Path]) -> float:
     """Mean PSNR over the bright pixels of the views with truth."""
-    from pipelines.render import read_render
+    from pipelines.views import read_render
     from rtgs.evaluate.metrics import psnr
     from rtgs.scenes.canonical import read_scene
 

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipelines.evaluate import TABLE_JSON
-from pipelines.render import read_render
 from pipelines.results import RUN_FILE, RunRecord
+from pipelines.views import read_render
 from rtgs.errors import RtgsError
 from rtgs.evaluate.evaluate import EvaluationTable, read_json
 from rtgs.evaluate.images import ERROR_FULL_SCALE, error_map, to_bytes

@@ -14,9 +14,10 @@ from omegaconf import DictConfig
 
 from pipelines.planning import describe, jobs_of_words, remote_store
 from pipelines.sweep import Sweep, current_sweep, prepared_outcomes
+from pipelines.words import friendly_overrides
 from rtgs.config.compose import VERSION_BASE, choices_from
 from rtgs.config.convert import to_run_config
-from rtgs.config.locate import choices_of, conf_dir
+from rtgs.config.locate import conf_dir
 from rtgs.config.schema import Choices, RunConfig, register_schema
 from rtgs.config.sweep import ComposedJob
 from rtgs.errors import RtgsError
@@ -128,40 +129,6 @@ def _set_threads(threads: int | None) -> None:
     import torch
 
     torch.set_num_threads(threads)
-
-
-def friendly_overrides(arguments: Sequence[str]) -> list[str]:
-    """Make a folder as good as a scene's name: ``scene=/my/capture`` or ``scene.path=/my/capture`` alone."""
-    rewritten: list[str] = []
-    for argument in arguments:
-        key, _, value = argument.partition("=")
-        plain = value.strip("'\"")
-        if key == "scene" and "," not in value and plain not in choices_of("scene") and _is_path(plain, arguments):
-            rewritten += ["scene=capture", f"scene.path={_quoted(plain)}"]
-        elif key == "scene.path" and not value.startswith(("'", '"')) and Path(value).expanduser().exists():
-            rewritten.append(f"scene.path={_quoted(value)}")
-        else:
-            rewritten.append(argument)
-    keys = {argument.partition("=")[0] for argument in rewritten}
-    if "scene.path" in keys and "scene" not in keys:
-        rewritten.append("scene=capture")
-    options = [argument for argument in rewritten if not _is_override(argument)]
-    return options + [argument for argument in rewritten if _is_override(argument)]  # argparse wants them in one piece
-
-
-def _is_path(text: str, arguments: Sequence[str]) -> bool:
-    """Whether a scene is a path: it exists, or looks like one (then the importer says that nothing is there)."""
-    own_files = any(argument.startswith(("--config-dir", "-cd")) for argument in arguments)  # may hold scene/group/name
-    return Path(text).expanduser().exists() or (not own_files and (os.sep in text or text.startswith(("~", "."))))
-
-
-def _is_override(argument: str) -> bool:
-    return argument.startswith("~") or ("=" in argument and not argument.startswith("-"))
-
-
-def _quoted(text: str) -> str:
-    escaped = text.replace("\\", "\\\\").replace("'", "\\'") if "'" in text else text
-    return f"'{escaped}'"
 
 
 class HydraApp:

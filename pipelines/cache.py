@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Sequence
 from pathlib import Path
 
+from pipelines.listing import columns
 from rtgs.errors import RtgsError
 from rtgs.pipeline import Artifact, RemoteStore, Store
 
@@ -124,9 +124,3 @@ def _recipes(words: list[str]) -> set[tuple[str, str]] | None:
     from pipelines.planning import steps_of_words
 
     return {(step.name, step.fingerprint) for step in steps_of_words(words)}
-
-
-def columns(rows: Sequence[Sequence[str]]) -> str:
-    """Rows of cells as text, every column as wide as its widest cell."""
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    return "\n".join("  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip() for row in rows)

@@ -155,7 +155,7 @@ def check(words: list[str]) -> int:
             raise RtgsError(f"rtgs check data=...: {unknown[0]!r} is not understood; only scene=NAME,... may follow")
         only = [name for word in words[1:] for name in word.removeprefix("scene=").split(",")]
         return check_dataset(words[0].removeprefix("data="), only)
-    from pipelines.app import friendly_overrides
+    from pipelines.words import friendly_overrides
     from rtgs.config import compose
     from rtgs.prepare.source import check_source
 

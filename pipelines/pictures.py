@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipelines.render import read_render, view_maps
+from pipelines.views import read_render, view_maps
 
 if TYPE_CHECKING:
     import numpy as np
@@ -53,7 +53,7 @@ def fixed_views(scene: Scene) -> tuple[View, ...]:
 
 
 def layer_pixels(maps: Mapping[str, Tensor], camera: Camera) -> dict[str, np.ndarray]:
-    """The layers people look at, as pixels; ``maps`` as :func:`pipelines.render.view_maps` gives them."""
+    """The layers people look at, as pixels; ``maps`` as :func:`pipelines.views.view_maps` gives them."""
     from rtgs.evaluate.images import to_bytes
     from rtgs.report.figures import alpha_picture, normal_picture
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from pipelines.cache import columns
 from pipelines.graph import RunGraph, build_graph
+from pipelines.listing import columns
 from pipelines.preparation import SkippedStep
 from pipelines.results import plan_rows
+from pipelines.words import friendly_overrides
 from rtgs.config.schema import Choices, RunConfig
 from rtgs.config.sweep import ComposedJob, compose_jobs
 from rtgs.errors import RtgsError
@@ -116,8 +117,6 @@ def jobs_of_words(words: Sequence[str]) -> tuple[tuple[ComposedJob, ...], bool]:
     Raises:
         RtgsError: an option besides ``--multirun``.
     """
-    from pipelines.app import friendly_overrides
-
     friendly = friendly_overrides(words)
     options = [word for word in friendly if word.startswith("-")]
     if unknown := [word for word in options if word not in ("-m", "--multirun")]:

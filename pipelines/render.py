@@ -9,13 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipelines.training import last_training, load_method
+from pipelines.views import read_render, view_maps
 from rtgs.pipeline import StepContext, StepKind
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from rtgs.evaluate.evaluate import TimedRender
-    from rtgs.methods import RenderedView
 
 TIMES_FILE = "render.json"
 GIVEN = "image_given_masks"  # of methods with a third stage: seen through the view's own mask, not the silhouette
@@ -66,27 +64,6 @@ def render(params: RenderParams, context: StepContext) -> None:
     (context.out / TIMES_FILE).write_text(json.dumps({"seconds": seconds}, indent=1) + "\n", encoding="utf-8")
     if seconds:
         context.log.info("rendered %d test views, %.3f s each", len(seconds), sum(seconds.values()) / len(seconds))
-
-
-def view_maps(rendered: RenderedView) -> dict[str, Tensor]:
-    """Depth, normal, alpha and the layers of a view rendered with ``depth``, as :func:`render` stores them."""
-    buffers = rendered.buffers
-    assert buffers.depth is not None
-    depth = buffers.depth / buffers.alpha.clamp_min(1e-6)  # the buffer holds the sum of w z
-    maps = {"depth": depth, "normal": buffers.normal, "alpha": buffers.alpha}
-    if rendered.layers is not None:
-        layers = vars(rendered.layers).items()
-        maps |= {name: tensor.float() for name, tensor in layers if tensor is not None}
-    return {name: tensor.contiguous() for name, tensor in maps.items() if tensor is not None}
-
-
-def read_render(folder: Path, view_name: str) -> dict[str, Tensor]:
-    """The tensors of one rendered view."""
-    from safetensors.torch import load_file
-
-    from rtgs.evaluate.images import file_stem
-
-    return load_file(folder / "views" / f"{file_stem(view_name)}.safetensors")
 
 
 def read_timed(folder: Path, view_name: str) -> TimedRender:

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 from pipelines import extract_mesh, train_transmittance
 from pipelines.evaluate import TABLE_JSON
-from pipelines.render import read_render
 from pipelines.training import last_training, read_history, read_summary
+from pipelines.views import read_render
 from rtgs.pipeline import StepContext, StepKind
 from rtgs.pipeline.manifest import Manifest
 

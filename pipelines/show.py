@@ -81,7 +81,7 @@ def _vector(text: str) -> tuple[float, float, float]:
 
 
 def _scene(options: argparse.Namespace) -> Scene:
-    from pipelines.app import friendly_overrides
+    from pipelines.words import friendly_overrides
     from rtgs.config import compose
     from rtgs.scenes.scene import load_scene
 

@@ -20,9 +20,9 @@ from PIL import Image
 from safetensors import SafetensorError
 
 from pipelines import import_scene
-from pipelines.app import friendly_overrides
 from pipelines.cli import main, report_error
 from pipelines.import_scene import ImportParams
+from pipelines.words import friendly_overrides
 from rtgs.pipeline import Store
 from rtgs.pipeline.step import StepFailed
 from rtgs.scenes.settings import SceneSettings

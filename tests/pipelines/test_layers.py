@@ -5,7 +5,7 @@ from pathlib import Path
 import torch
 from safetensors.torch import save_file
 
-from pipelines import render, report
+from pipelines import render, report, views
 
 
 def rendered_view(folder: Path, layers: bool) -> dict[str, torch.Tensor]:
@@ -22,7 +22,7 @@ def rendered_view(folder: Path, layers: bool) -> dict[str, torch.Tensor]:
 
 def test_the_page_gets_the_diffuse_part_and_the_evaluation_the_reflection(tmp_path: Path) -> None:
     tensors = rendered_view(tmp_path, layers=True)
-    layers = report._layers(render.read_render(tmp_path, "a.png"))
+    layers = report._layers(views.read_render(tmp_path, "a.png"))
     assert set(layers) == {"diffuse", "reflection", "normal", "specular", "roughness", "f0"}
     torch.testing.assert_close(layers["diffuse"], (1 - tensors["specular"]) * tensors["diffuse"])
     timed = render.read_timed(tmp_path, "a.png")
@@ -33,5 +33,5 @@ def test_the_page_gets_the_diffuse_part_and_the_evaluation_the_reflection(tmp_pa
 
 def test_methods_without_reflection_have_none(tmp_path: Path) -> None:
     rendered_view(tmp_path, layers=False)
-    assert report._layers(render.read_render(tmp_path, "a.png")) == {}
+    assert report._layers(views.read_render(tmp_path, "a.png")) == {}
     assert render.read_timed(tmp_path, "a.png").reflection is None
