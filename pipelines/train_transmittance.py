@@ -49,7 +49,7 @@ def _numbers(scores: BoundaryScores, when: str) -> dict[str, float]:
 
 STEP = StepKind(
     "train_transmittance",
-    3,
+    4,
     train_transmittance,
     helpers=(
         *train_reflection.STEP.helpers,

@@ -220,8 +220,9 @@ class ReflectiveMethod(SurfelMethod):
         if glass is None:
             return reflection, torch.zeros(())
         inside = pixel_weights(rays.cosine, pixels, optics if gain is None else replace(optics, max_gain=gain))
-        largest = self.settings.transmittance.max_weight
-        own = inside.reflection.clamp_max(largest) if largest > 0 else inside.reflection
+        transmittance = self.settings.transmittance
+        bounded = transmittance.max_weight > 0 and transmittance.interface.count > 0
+        own = inside.reflection.clamp_max(transmittance.max_weight) if bounded else inside.reflection
         return torch.where(glass, own, reflection), inside.transmission
 
     def _flat_pixels(self, buffers: RasterBuffers) -> SurfacePixels:

@@ -68,7 +68,7 @@ class TransmissiveMethod(GlassStage):
             inside = mask
         else:
             inside = mask & surfaces.hit  # methods.md 6.3: where the ray misses the mesh nothing is transmitted
-        inside = widened(inside, settings.rim)
+        inside = widened(inside, settings.rim if settings.interface.count > 0 else 0)
         glass = self._on_glass(surfaces)
         return glass_pixels(flat, surfaces, inside, glass, first_surface=settings.first_surface, normal=settings.normal)
 

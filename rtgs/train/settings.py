@@ -294,8 +294,11 @@ class TransmittanceSettings:
     first_surface: str = "mesh"  # where the object's pixels have their surface; the paper: "base", the rasterised depth
     normal: str = "base"  # the rasterised normals there (of the interface, if there is one); "mesh": fixed, for tests
     max_gain: float | None = None  # S_max in the object's pixels; None: optics.max_gain
-    max_weight: float = 1.0  # largest w_r there: an S_max of 16 alone lets the rim glow and darkens the set; 0: none
-    rim: int = 2  # pixels around the object's that get straight rays too: interface surfels reach over its outline
+    # Both of the interface, without one (interface.count 0, the paper) neither acts: the largest w_r in the object's
+    # pixels, for an S_max of 16 alone lets its rim glow and darkens the set (0: none), and how many pixels around them
+    # get straight rays too, for interface surfels reach over the outline.
+    max_weight: float = 1.0
+    rim: int = 2
     # Share of the masked pixels whose base depth is the object's first surface; with more the object is opaque and the
     # stage left out (docs/transmittance.md: thin glass 0.05 to 0.5). 1: never.
     opaque_share: float = 0.9

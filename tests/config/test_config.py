@@ -237,9 +237,6 @@ def test_a_scene_sets_no_keys_but_its_own(scene):
     assert {"name", "path"} <= set(yaml.safe_load(text))
 
 
-WHOLE_WAYS = ("paper_glass",)  # everything the design does differently from the paper at once, not one choice
-
-
 @pytest.mark.parametrize("ablation", ABLATIONS)
 def test_an_ablation_flips_one_to_three_keys_and_says_why(ablation):
     content = ablation_file(ablation)
@@ -250,7 +247,7 @@ def test_an_ablation_flips_one_to_three_keys_and_says_why(ablation):
     def leaves(value: object) -> int:
         return sum(map(leaves, value.values())) if isinstance(value, dict) else 1
 
-    assert 1 <= leaves(content) <= (5 if ablation in WHOLE_WAYS else 3)
+    assert 1 <= leaves(content) <= 3
 
 
 EXPERIMENTS = choices_of("experiment")

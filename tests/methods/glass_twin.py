@@ -64,7 +64,7 @@ class GlassTwin:
         own = pixel_weights(
             mirrored.cosine, flat, optics if gain is None else replace(optics, max_gain=gain)
         ).reflection
-        if self.settings.max_weight > 0:
+        if self.settings.max_weight > 0 and self.settings.interface.count > 0:
             near_bound = (own - self.settings.max_weight).abs() < 1e-4
             self.fragile |= inside & (near_bound if near_bound.ndim == 1 else near_bound.any(0))
             own = own.clamp_max(self.settings.max_weight)
