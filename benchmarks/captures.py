@@ -70,8 +70,8 @@ class Measured:
     views: int
 
 
-def run(job: Job, arguments: argparse.Namespace) -> Measured | str:
-    """Run the job, or find it done; a string is why it failed."""
+def finish(job: Job, arguments: argparse.Namespace) -> Path | str:
+    """Run the job, or find it done: its ``metrics.json``; a string is why it failed."""
     name = job.name(arguments)
     command = [sys.executable, "-m", "pipelines.run", *job.words(arguments), f"name={name}"]
     environment = os.environ | {"OMP_NUM_THREADS": str(arguments.threads)}
@@ -80,7 +80,13 @@ def run(job: Job, arguments: argparse.Namespace) -> Measured | str:
     )
     if done.returncode:
         return (done.stderr.strip().splitlines() or ["no message"])[-1]
-    return read(arguments.root / "runs" / name / "metrics.json")
+    return arguments.root / "runs" / name / "metrics.json"
+
+
+def run(job: Job, arguments: argparse.Namespace) -> Measured | str:
+    """Run the job, or find it done; a string is why it failed."""
+    path = finish(job, arguments)
+    return path if isinstance(path, str) else read(path)
 
 
 def read(path: Path) -> Measured | str:
@@ -103,19 +109,14 @@ def read(path: Path) -> Measured | str:
 
 def row(scene: str, method: str, found: Sequence[Measured]) -> list[str]:
     """One line of the table from the runs of all seeds."""
-
-    def spread(values: Sequence[float], digits: int) -> str:
-        middle = f"{statistics.fmean(values):.{digits}f}"
-        return middle if len(values) < 2 else f"{middle} +- {statistics.stdev(values):.{digits}f}"
-
     return [
         scene,
         method,
         found[0].size,
         str(found[0].views),
-        spread([one.psnr for one in found], 2),
-        spread([one.ssim for one in found], 4),
-        spread([one.seconds for one in found], 1),
+        over_seeds([one.psnr for one in found], 2),
+        over_seeds([one.ssim for one in found], 4),
+        over_seeds([one.seconds for one in found], 1),
         f"{statistics.fmean(one.ms_per_step for one in found):.1f}",
         f"{max(one.peak_mb for one in found):.0f}",
         f"{statistics.fmean(one.gaussians for one in found):,.0f}",
@@ -123,9 +124,15 @@ def row(scene: str, method: str, found: Sequence[Measured]) -> list[str]:
     ]
 
 
-def table(rows: Sequence[Sequence[str]]) -> str:
+def over_seeds(values: Sequence[float], digits: int, sign: str = "") -> str:
+    """Mean and, of several seeds, standard deviation; ``sign="+"`` shows the sign of either."""
+    middle = f"{statistics.fmean(values):{sign}.{digits}f}"
+    return middle if len(values) < 2 else f"{middle} +- {statistics.stdev(values):.{digits}f}"
+
+
+def table(rows: Sequence[Sequence[str]], columns: Sequence[str] = COLUMNS) -> str:
     """The rows as Markdown."""
-    return "\n".join("| " + " | ".join(cells) + " |" for cells in (COLUMNS, ["---"] * len(COLUMNS), *rows)) + "\n"
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in (columns, ["---"] * len(columns), *rows)) + "\n"
 
 
 def measure(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -172,17 +179,22 @@ def scenes_here() -> list[str]:
     return ["demo", *(name for name in SHARED_SCENES if (shared / name).is_dir())]
 
 
-def parse() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])  # type: ignore[union-attr]
+def add_arguments(parser: argparse.ArgumentParser, methods: Sequence[str]) -> None:
+    """What names the runs: benchmarks with the same words share them."""
     add = parser.add_argument
     add("--preset", default="quick")
     add("--scenes", nargs="+", help="scene configs (default: demo and the captures of RTGS_SHARED)")
-    add("--methods", nargs="+", default=list(METHODS), help="METHOD or METHOD+ABLATION (default: %(default)s)")
+    add("--methods", nargs="+", default=list(methods), help="METHOD or METHOD+ABLATION (default: %(default)s)")
     add("--seeds", nargs="+", type=int, default=[0])
     add("--threads", type=int, default=1)
     add("--root", type=Path, default=Path("benchmarks/results"), help="folder of store and runs (default: %(default)s)")
-    add("--out", type=Path, help="Markdown file (default: ROOT/captures-PRESET.md)")
     add("--set", nargs="*", default=[], metavar="key=value", help="more words for `rtgs run`")
+
+
+def parse() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])  # type: ignore[union-attr]
+    add_arguments(parser, METHODS)
+    parser.add_argument("--out", type=Path, help="Markdown file (default: ROOT/captures-PRESET.md)")
     arguments = parser.parse_args()
     arguments.scenes = arguments.scenes or scenes_here()
     arguments.out = arguments.out or arguments.root / f"captures-{arguments.preset}.md"
