@@ -2,7 +2,8 @@
 
 ``python -m benchmarks.losses``: CPU milliseconds of the calling thread, which other work on the machine disturbs least,
 the fastest of many calls. The last line is a JSON object: ``{loss}_{size}_ms``, ``{loss}_{size}_torch_ms``,
-``{loss}_{size}_ratio`` (torch / native) and the instruction set.
+``{loss}_{size}_ratio`` (torch / native) and the instruction set. The perceptual loss, with random weights of VGG-16's
+shapes: ``perceptual_crop_ms`` (the random crop that training looks at) and ``perceptual_{size}_ms`` (the whole image).
 """
 
 from __future__ import annotations
@@ -18,11 +19,16 @@ import torch
 from torch import Tensor
 
 from rtgs.cameras import Camera
+from rtgs.evaluate.lpips import Lpips
+from rtgs.evaluate.vgg import BLOCKS, VGG16_WIDTHS, Vgg16Features
 from rtgs.native import core
 from rtgs.train import losses, reference_losses
+from rtgs.train.perceptual import PerceptualLoss
+from rtgs.train.settings import LossSettings
 
 SIZES = ((400, 300), (800, 600))  # width, height
-NATIVE_CALLS, TORCH_CALLS = 60, 10
+PERCEPTUAL_SIZE = (256, 192)
+NATIVE_CALLS, TORCH_CALLS, PERCEPTUAL_CALLS = 60, 10, 4
 
 
 @dataclass(frozen=True)
@@ -73,6 +79,31 @@ def fastest_ms(step: Callable[[], Tensor], case: Case, calls: int) -> float:
     return 1e3 * best
 
 
+def random_vgg(widths: tuple[int, ...]) -> Lpips:
+    """The perceptual network with random weights: what it costs does not depend on them."""
+    generator, tensors, channels = torch.Generator().manual_seed(0), {}, 3
+    for width, block in zip(widths, BLOCKS, strict=True):
+        for position in block:
+            deviation = (2 / (9 * channels)) ** 0.5  # activations keep their size
+            shape = (width, channels, 3, 3)
+            tensors[f"features.{position}.weight"] = deviation * torch.randn(shape, generator=generator)
+            tensors[f"features.{position}.bias"] = torch.zeros(width)
+            channels = width
+    heads = {f"lin{k}.model.1.weight": torch.rand(1, width, 1, 1) for k, width in enumerate(widths)}
+    return Lpips(Vgg16Features(tensors), heads)
+
+
+def perceptual_figures(size: tuple[int, int], widths: tuple[int, ...] = VGG16_WIDTHS) -> dict[str, float]:
+    """CPU milliseconds of the perceptual loss, on a crop and on the whole image."""
+    network, case = random_vgg(widths), make_case(*size)
+    found = {}
+    for name, crop in (("crop", LossSettings().perceptual_crop), ("x".join(map(str, size)), max(size))):
+        loss, generator = PerceptualLoss(LossSettings(perceptual_crop=crop), network), torch.Generator().manual_seed(0)
+        step = partial(loss, case.image, case.target, generator)
+        found[f"perceptual_{name}_ms"] = fastest_ms(step, case, PERCEPTUAL_CALLS)
+    return found
+
+
 def main() -> None:
     torch.set_num_threads(1)
     results: dict[str, float | str] = {"isa": core.isa()}
@@ -85,6 +116,10 @@ def main() -> None:
             key = f"{name}_{width}x{height}"
             results |= {f"{key}_ms": ours, f"{key}_torch_ms": theirs, f"{key}_ratio": theirs / ours}
             print(f"{key:32s} native {ours:8.2f} ms   torch {theirs:8.2f} ms   {theirs / ours:6.1f}x")
+    perceptual = perceptual_figures(PERCEPTUAL_SIZE)
+    for key, value in perceptual.items():
+        print(f"{key:32s} {value:8.1f} ms")
+    results |= perceptual
     print(json.dumps({key: round(value, 3) if isinstance(value, float) else value for key, value in results.items()}))
 
 

@@ -240,7 +240,8 @@ def measure(arguments: argparse.Namespace, kept: dict[str, Any]) -> dict[str, An
     if "end_to_end" in arguments.parts:
         torch.set_num_threads(arguments.threads)
         words, size = arguments.lever_scene.split(), arguments.long_side
-        chosen = tuple(SETTINGS)[: arguments.lever_settings]
+        first, *others = tuple(SETTINGS)[: arguments.lever_settings]
+        chosen = (first, *(name for name in others if name in (arguments.lever_names or others)))
         found = end_to_end_points(words, arguments.lever_steps, size, chosen)
         figures["end_to_end"] = [asdict(point) for point in found]
     if "tracer" in arguments.parts:
@@ -263,6 +264,7 @@ def parse() -> argparse.Namespace:
     add("--lever-scene", default="scene=demo", help="config words of the scene of end_to_end")
     add("--lever-steps", type=int, help="of its reference run (1000; quick: 200)")
     add("--lever-settings", type=int, help="how many of its settings (all; quick: 4)")
+    add("--lever-names", nargs="+", choices=tuple(SETTINGS)[1:], metavar="NAME", help="which of them (all)")
     add("--scenes", nargs="+", help="scene configs (demo, and fox where RTGS_SHARED has it; quick: demo)")
     add("--steps", type=int, nargs="+", help="lengths of training at the largest cap")
     add("--caps", type=int, nargs="+", help="caps on surfels at the most steps")

@@ -8,9 +8,15 @@ shrunk along; a matte verdict is switched off, because it would end what is to b
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from torch.nn.functional import avg_pool2d, normalize
 
 from benchmarks.training_runs import schedule_overrides, train_run
+
+if TYPE_CHECKING:
+    from rtgs.scenes.scene import Scene, View
 
 PRESET = "quick"
 TRACED = "method.reflection.traced"
@@ -29,7 +35,9 @@ SETTINGS: dict[str, tuple[str, ...]] = {  # the first is the reference: every pi
     "rebuilt every 1000 steps": (f"{TRACED}.threshold=0", "method.reflection.rebuild_every=1000"),
     "transmittance cutoff 1e-2": (f"{TRACED}.threshold=0", "method.reflection.transmittance_cutoff=0.01"),
     "alpha cutoff 1/64": (f"{TRACED}.threshold=0", "method.reflection.alpha_cutoff=0.015625"),
+    "half the resolution": (f"{TRACED}.threshold=0",),  # of the training views, for rasteriser and tracer alike
 }
+HALVED = "half the resolution"
 NOT_MATTE = "method.reflection.matte.probation=0"
 
 
@@ -64,9 +72,22 @@ def end_to_end_points(
 def _train(scene: Sequence[str], name: str, equal: str, steps: int, long_side: int | None) -> EndToEndPoint:
     words = [*scene, "method=rtgs", f"preset={PRESET}", *schedule_overrides(steps, PRESET), NOT_MATTE]
     words += [*PUBLISHED, *SETTINGS[name]]
-    run = train_run(words, long_side)
+    run = train_run(words, long_side, half_resolution if name == HALVED else None)
     quality = run.quality()
     psnr, specular = (
         None if value is None else round(value, 3) for value in (quality["psnr"], quality["psnr_specular"])
     )
     return EndToEndPoint(name, equal, steps, round(run.cpu_seconds, 2), psnr, specular)
+
+
+def half_resolution(scene: Scene) -> Scene:
+    """The scene with training views of half the width and height; test views stay as they are."""
+    return replace(scene, train=tuple(_halved(view) for view in scene.train))
+
+
+def _halved(view: View) -> View:
+    height, width = (size // 2 * 2 for size in view.image.shape[1:])
+    normal = view.normal if view.normal is None else normalize(avg_pool2d(view.normal[:, :height, :width], 2), dim=0)
+    camera = replace(view.camera, width=width, height=height).resized(width // 2, height // 2)
+    mask = view.mask if view.mask is None else view.mask[:height:2, :width:2]
+    return replace(view, camera=camera, image=avg_pool2d(view.image[:, :height, :width], 2), mask=mask, normal=normal)

@@ -39,6 +39,8 @@ class StageShares:
     stage: str
     steps: int
     seconds: float
+    cpu_seconds: float  # of all threads
+    preset_steps: int  # of this stage when the schedule is not shrunk
     shares: dict[str, float]  # by part; they add up to 1
     fixed: float  # share of what a step costs without pixels and surfels; contained in the others
     rays: float  # mean number of mirror rays a step
@@ -131,23 +133,28 @@ def clocks(clock: PartClock) -> Iterator[None]:
             setattr(owner, name, before)
 
 
-def stage_shares(method: Method, scene: Scene, seed: int, now: Callable[[], float]) -> list[StageShares]:
-    """Train every stage of the method under the clocks."""
+def stage_shares(
+    method: Method, scene: Scene, seed: int, now: Callable[[], float], preset_steps: Sequence[int]
+) -> list[StageShares]:
+    """Train every stage of the method under the clocks; ``preset_steps``: by stage, in the schedule as it is."""
     from rtgs.train.trainer import Trainer
 
     found = []
-    for stage in method.stages:
+    for stage, whole in zip(method.stages, preset_steps, strict=True):
         clock = PartClock(now)
         trainer = Trainer(method, scene, seed=seed, stage=stage)
+        began = time.process_time()
         with clocks(clock), clock.part("shading"):
             trainer.run()
+        spent = time.process_time() - began
         seconds = sum(clock.seconds.values())
         steps = stage.until - stage.from_step
         fixed = steps * fixed_seconds(method, scene, stage, now)
         shares = {part: clock.seconds[part] / seconds for part in PARTS if clock.seconds[part] > 0}
         surfels = {part.name: len(part) for part in method.sets}
         rays, hits = clock.rays / steps, clock.hits / max(clock.rays, 1)
-        found.append(StageShares(stage.name, steps, seconds, shares, fixed / seconds, rays, hits, surfels))
+        timed = (steps, seconds, spent, whole)
+        found.append(StageShares(stage.name, *timed, shares, fixed / seconds, rays, hits, surfels))
     return found
 
 
@@ -181,27 +188,38 @@ def fixed_seconds(method: Method, scene: Scene, stage: Stage, now: Callable[[], 
     return median(times)
 
 
-def measure(words: Sequence[str], threads: int) -> list[StageShares]:
-    """Compose, load, train under the clocks."""
+def measure(words: Sequence[str], shrunk: Sequence[str], threads: int) -> list[StageShares]:
+    """Compose, load, train under the clocks; ``shrunk``: the words that shorten the schedule."""
     from rtgs.config.compose import compose
-    from rtgs.methods import create_method
+    from rtgs.methods import create_method, method_stages
     from rtgs.scenes.scene import load_scene
     from rtgs.train.seeds import generator_for
 
     torch.set_num_threads(threads)
-    config, _ = compose(list(words))
+    config, _ = compose([*words, *shrunk])
+    whole = compose(list(words))[0]
     scene = replace(load_scene(config.scene), test=())
     method = create_method(config.method, scene, config.schedule, generator_for(config.seed, "initialise"))
-    return stage_shares(method, scene, config.seed, time.thread_time if threads == 1 else time.perf_counter)
+    stages = method_stages(whole.method, whole.schedule)
+    clock = time.thread_time if threads == 1 else time.perf_counter
+    return stage_shares(method, scene, config.seed, clock, [stage.until - stage.from_step for stage in stages])
+
+
+def whole_minutes(stages: Sequence[StageShares]) -> tuple[float, float]:
+    """Minutes by the clock of the benchmark, and CPU minutes of all threads, of the training as the preset has it."""
+    scale = [stage.preset_steps / stage.steps / 60 for stage in stages]
+    by_clock = sum(factor * stage.seconds for factor, stage in zip(scale, stages, strict=True))
+    return by_clock, sum(factor * stage.cpu_seconds for factor, stage in zip(scale, stages, strict=True))
 
 
 def table(stages: Sequence[StageShares]) -> str:
     """Markdown, a row per stage."""
     parts = [part for part in PARTS if any(part in stage.shares for stage in stages)]
-    lines = ["| stage | steps | s | ms a step | " + " | ".join(parts) + " | fixed | rays | hits a ray |"]
-    lines.append("|" + "---|" * (len(parts) + 7))
+    lines = ["| stage | steps | s | CPU s | ms a step | " + " | ".join(parts) + " | fixed | rays | hits a ray |"]
+    lines.append("|" + "---|" * (len(parts) + 8))
     for stage in stages:
-        cells = [stage.stage, f"{stage.steps:,}", f"{stage.seconds:.0f}", f"{1e3 * stage.seconds / stage.steps:.1f}"]
+        cells = [stage.stage, f"{stage.steps:,}", f"{stage.seconds:.0f}", f"{stage.cpu_seconds:.0f}"]
+        cells += [f"{1e3 * stage.seconds / stage.steps:.1f}"]
         cells += [f"{100 * stage.shares.get(part, 0):.0f} %" for part in parts]
         cells += [f"{100 * stage.fixed:.0f} %", f"{stage.rays:,.0f}", f"{stage.hits:.0f}"]
         lines.append("| " + " | ".join(cells) + " |")
@@ -218,11 +236,18 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1)
     options = parser.parse_args()
     words = [f"scene={options.scene}", f"method={options.method}", f"preset={options.preset}", *options.set]
-    words += schedule_overrides(options.steps, options.preset) if options.steps else []
-    stages = measure(words, options.threads)
+    shrunk = schedule_overrides(options.steps, options.preset) if options.steps else []
+    stages = measure(words, shrunk, options.threads)
+    minutes, cpu_minutes = whole_minutes(stages)
+    extrapolated = any(stage.steps != stage.preset_steps for stage in stages)
     print(table(stages))
+    kind = "CPU, one thread" if options.threads == 1 else f"by the clock, {options.threads} threads"
+    source = "extrapolated from milliseconds a step" if extrapolated else "measured"
+    print(f"\nWhole training: {minutes:.1f} min {kind}; {cpu_minutes:.1f} CPU min of all threads ({source}).")
     result = {"scene": options.scene, "method": options.method, "preset": options.preset, "threads": options.threads}
-    result |= {"seconds": round(sum(stage.seconds for stage in stages), 1), "stages": [asdict(s) for s in stages]}
+    result |= {"seconds": round(sum(stage.seconds for stage in stages), 1), "extrapolated": extrapolated}
+    result |= {"minutes": round(minutes, 3), "cpu_minutes": round(cpu_minutes, 3)}
+    result |= {"stages": [asdict(stage) for stage in stages]}
     print(json.dumps(result))
 
 

@@ -18,6 +18,7 @@ from benchmarks import (
     gaussians,
     losses,
     masks,
+    optics_gain,
     raster,
     raster_ellipsoids,
     sfm,
@@ -25,11 +26,13 @@ from benchmarks import (
     trace,
     trace_levers,
     trace_scene,
+    trace_training,
     train_step,
     training_parts,
     training_runs,
 )
 from rtgs.native import core
+from tests.methods.mirror_scene import mirror_scene
 
 
 @pytest.fixture(autouse=True)
@@ -120,6 +123,16 @@ def test_speed_error_end_to_end(run, tmp_path: Path) -> None:
     assert all(point["psnr"] > 0 and point["cpu_seconds"] > 0 for point in points)
 
 
+def test_half_the_resolution_is_of_the_training_views_alone() -> None:
+    made = mirror_scene(8, 25, 18, points=20, test_every=8).scene
+    half = trace_training.half_resolution(made)
+    assert half.test == made.test
+    before, after = made.train[0], half.train[0]
+    assert after.image.shape == (3, 9, 12)
+    assert (after.camera.width, after.camera.height, after.camera.fx) == (12, 9, before.camera.fx / 2)
+    assert after.image[:, 0, 0].tolist() == pytest.approx(before.image[:, :2, :2].mean((1, 2)).tolist())
+
+
 def test_train_step(run) -> None:
     figures = run(train_step, "--rounds", "1")
     parts = ("activate", "raster", "photometric", "normal", "adam", "density")
@@ -140,6 +153,19 @@ def test_training_parts(run) -> None:
     for stage in figures["stages"]:
         assert math.isclose(sum(stage["shares"].values()), 1, abs_tol=1e-6)
         assert stage["fixed"] > 0
+    assert figures["extrapolated"]
+    assert sum(stage["preset_steps"] for stage in figures["stages"]) == 120, "those of the preset"
+    expected = sum(stage["seconds"] * stage["preset_steps"] / stage["steps"] for stage in figures["stages"]) / 60
+    assert figures["minutes"] == pytest.approx(expected, abs=6e-4)
+    assert figures["cpu_minutes"] > 0
+
+
+def test_optics_gain(run, tmp_path: Path) -> None:
+    figures = run(optics_gain, str(tmp_path / "gain.png"))
+    assert (tmp_path / "gain.png").read_bytes().startswith(b"\x89PNG")
+    largest = figures["largest_gain"]
+    assert largest["S_max 1"]["f0 0.04"] <= 1, "energy is conserved"
+    assert largest["S_max 16"]["f0 0.04"] > 4, "near grazing"
 
 
 def test_captures(run, tmp_path: Path) -> None:
@@ -165,7 +191,10 @@ def test_losses(run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(losses, "SIZES", ((40, 30),))
     monkeypatch.setattr(losses, "NATIVE_CALLS", 1)
     monkeypatch.setattr(losses, "TORCH_CALLS", 1)
+    monkeypatch.setattr(losses, "PERCEPTUAL_SIZE", (72, 66))
+    monkeypatch.setattr(losses, "PERCEPTUAL_CALLS", 1)
     figures = run(losses)
+    assert 0 < figures["perceptual_crop_ms"] < figures["perceptual_72x66_ms"] * 4
     for name in ("photometric", "normal", "normal_depth_weighted", "mono_normal"):
         assert all(figures[f"{name}_40x30_{kind}"] >= 0 for kind in ("ms", "torch_ms", "ratio"))
     assert figures["isa"] == core.isa()
