@@ -9,11 +9,11 @@ Training: PSNR and SSIM of the held-out views against CPU seconds of training, f
 surfels, and the number of steps with the schedule shrunk along. Each run starts from the preset ``quick``; one run per
 point. Peak memory is that of each run where the kernel lets a process reset it (Linux), else of the process so far.
 
-Tracer: time against error of what makes it faster (``benchmarks.trace_levers``), plotted apart; and end to end, PSNR
-after equal time (``benchmarks.trace_training``).
+Rasteriser and tracer: time against error of what makes them faster (``benchmarks.raster_levers``,
+``benchmarks.trace_levers``), plotted apart; and end to end, PSNR after equal time (``benchmarks.trace_training``).
 
-Writes ``speed_error.png``, ``speed_error_tracer.png`` and ``speed_error.json`` into ``benchmarks/results`` and prints
-the JSON as its last line.
+Writes ``speed_error.png``, ``speed_error_rasterizer.png``, ``speed_error_tracer.png`` and ``speed_error.json`` into
+``benchmarks/results`` and prints the JSON as its last line.
 """
 
 from __future__ import annotations
@@ -35,9 +35,11 @@ import torch
 from torch import Tensor
 
 from benchmarks.machine import machine
+from benchmarks.raster_levers import defaults as raster_defaults
+from benchmarks.raster_levers import raster_lever_figures
 from benchmarks.speed_error_plot import GRADIENT_BOUND, PICTURE_BOUND, draw
 from benchmarks.trace_levers import defaults, lever_figures
-from benchmarks.trace_levers_plot import draw_levers
+from benchmarks.trace_levers_plot import draw_levers, draw_raster_levers
 from benchmarks.trace_training import SETTINGS, end_to_end_points
 from benchmarks.training_runs import schedule_overrides, train_run
 from benchmarks.yardstick_scene import HEIGHT, SCALES, WIDTH, made_arrays
@@ -55,7 +57,7 @@ INPUTS = ("means", "tangent_u", "tangent_v", "scales", "opacities", "features")
 PICTURES = ("features", "alpha", "depth", "normal")
 TWIN_ROUNDS = 2  # the dense twins take seconds
 METHOD, PRESET = "rtgs", "quick"
-PARTS = ("kernel", "training", "tracer", "end_to_end")
+PARTS = ("kernel", "training", "rasterizer", "tracer", "end_to_end")
 
 
 @dataclass(frozen=True)
@@ -220,7 +222,7 @@ def scenes_here() -> list[str]:
 def measure(arguments: argparse.Namespace, kept: dict[str, Any]) -> dict[str, Any]:
     """All figures that were asked for, and those of ``kept`` for parts that were not."""
     figures: dict[str, Any] = {"machine": machine(), "kernel": None, "training": [], "training_runs_per_point": 1}
-    figures |= {"training_threads": arguments.threads, "tracer": None, "end_to_end": []} | kept
+    figures |= {"training_threads": arguments.threads, "rasterizer": None, "tracer": None, "end_to_end": []} | kept
     if "training" in arguments.parts:  # first: memory that the twins leave behind is not training's
         torch.set_num_threads(arguments.threads)
         figures |= {"training_threads": arguments.threads, "training": []}
@@ -244,10 +246,11 @@ def measure(arguments: argparse.Namespace, kept: dict[str, Any]) -> dict[str, An
         chosen = (first, *(name for name in others if name in (arguments.lever_names or others)))
         found = end_to_end_points(words, arguments.lever_steps, size, chosen)
         figures["end_to_end"] = [asdict(point) for point in found]
-    if "tracer" in arguments.parts:
+    measured = {"rasterizer": raster_lever_figures, "tracer": lever_figures}
+    for part in measured.keys() & set(arguments.parts):
         torch.set_num_threads(1)
-        figures["tracer"] = lever_figures(arguments.lever_surfels, max(2, arguments.rounds // 6))
-        for point in figures["tracer"]["points"]:
+        figures[part] = measured[part](arguments.lever_surfels, max(2, arguments.rounds // 6))
+        for point in figures[part]["points"]:
             print("  ".join(f"{key} {value}" for key, value in point.items()))
     return figures
 
@@ -260,7 +263,7 @@ def parse() -> argparse.Namespace:
     add("--surfels", type=int, help="of the kernel scene (1000; quick: 500)")
     add("--width", type=int, help="of the kernel scene's picture in pixels (96; quick: 64)")
     add("--rounds", type=int, help="of the native kernels (30; quick: 10)")
-    add("--lever-surfels", type=int, choices=(20_000, 100_000), help="of the tracer's levers (100,000; quick: 20,000)")
+    add("--lever-surfels", type=int, choices=(20_000, 100_000), help="of the levers (100,000; quick: 20,000)")
     add("--lever-scene", default="scene=demo", help="config words of the scene of end_to_end")
     add("--lever-steps", type=int, help="of its reference run (1000; quick: 200)")
     add("--lever-settings", type=int, help="how many of its settings (all; quick: 4)")
@@ -299,6 +302,8 @@ def main() -> None:
     record.parent.mkdir(parents=True, exist_ok=True)
     record.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
     draw(figures, arguments.output / f"{NAME}.png")
+    if figures["rasterizer"]:
+        draw_raster_levers(figures, raster_defaults(), arguments.output / f"{NAME}_rasterizer.png")
     if figures["tracer"]:
         draw_levers(figures, defaults(), arguments.output / f"{NAME}_tracer.png")
     print(json.dumps(figures))

@@ -1,4 +1,4 @@
-"""The plot of the tracer's part of ``benchmarks.speed_error``: what each lever saves and what it costs."""
+"""The plots of the levers of ``benchmarks.speed_error``, tracer and rasteriser: what each saves and what it costs."""
 
 from __future__ import annotations
 
@@ -20,26 +20,52 @@ def draw_levers(figures: dict[str, Any], defaults: dict[str, float], path: Path)
     from matplotlib.figure import Figure
 
     tracer = figures["tracer"]
-    lines: dict[str, list[dict[str, Any]]] = {}
-    for point in tracer["points"]:
-        lines.setdefault(point["lever"], []).append(point)
+    lines = _by_lever(tracer["points"])
     figure = Figure(figsize=(15, 4.6), layout="constrained")
     picture, gradient, refit = figure.subplots(1, 3, width_ratios=(1.2, 1.2, 0.8))
+    _draw_pair(picture, gradient, lines, defaults)
+    _draw_refit(refit, lines["refit_interval"], defaults)
+    rays = f"{tracer['surfels']:,} surfels, {tracer['rays']:,} reflected rays"
+    _finish(figure, (picture, gradient, refit), figures["machine"], rays, path)
+
+
+def draw_raster_levers(figures: dict[str, Any], defaults: dict[str, float], path: Path) -> None:
+    """PSNR and gradient error of the rasteriser over relative time."""
+    from matplotlib.figure import Figure
+
+    raster = figures["rasterizer"]
+    figure = Figure(figsize=(11.5, 4.6), layout="constrained")
+    picture, gradient = figure.subplots(1, 2)
+    _draw_pair(picture, gradient, _by_lever(raster["points"]), defaults)
+    width, height = raster["image"]
+    what = f"{raster['surfels']:,} surfels, {width}x{height} pixels"
+    _finish(figure, (picture, gradient), figures["machine"], what, path)
+
+
+def _by_lever(points: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
+    lines: dict[str, list[dict[str, Any]]] = {}
+    for point in points:
+        lines.setdefault(point["lever"], []).append(point)
+    return lines
+
+
+def _draw_pair(picture, gradient, lines: dict[str, list[dict[str, Any]]], defaults: dict[str, float]) -> None:
     _draw_errors(picture, lines, "psnr", defaults)
     _draw_errors(gradient, lines, "gradient_error", defaults)
-    _draw_refit(refit, lines["refit_interval"], defaults)
     picture.set_title("Picture: up is more exact", loc="left", fontsize=11)
     picture.set_ylabel("PSNR against no cut, dB")
     gradient.set_title("Gradient of the means: down is more exact", loc="left", fontsize=11)
     gradient.set_ylabel("relative L2 error")
     gradient.set_yscale("log")
-    for axes in (picture, gradient, refit):
+
+
+def _finish(figure, panels, machine: dict[str, Any], what: str, path: Path) -> None:
+    for axes in panels:
         axes.grid(True, which="major", color="#e3e6ea", lw=0.8)
         axes.set_axisbelow(True)
         axes.spines[["top", "right"]].set_visible(False)
-    found = figures["machine"]
-    where = f"{found['processor']}, {found['isa']}; CPU time of one thread, forward + backward; "
-    where += f"{tracer['surfels']:,} surfels, {tracer['rays']:,} reflected rays; ringed: defaults"
+    where = f"{machine['processor']}, {machine['isa']}; CPU time of one thread, forward + backward; "
+    where += f"{what}; ringed: defaults"
     figure.supxlabel(where, fontsize=8, color="#5c6670")
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=120, metadata={"Software": None})
@@ -47,7 +73,7 @@ def draw_levers(figures: dict[str, Any], defaults: dict[str, float], path: Path)
 
 def _draw_errors(axes, lines: dict[str, list[dict[str, Any]]], key: str, defaults: dict[str, float]) -> None:
     for lever, (title, color, marker) in STYLES.items():
-        shown = [p for p in lines[lever] if p[key]]  # None and exact answers have no place on the axis
+        shown = [p for p in lines.get(lever, []) if p[key]]  # None and exact answers have no place on the axis
         if not shown:
             continue
         at = [(p["relative_time"], p[key]) for p in shown]

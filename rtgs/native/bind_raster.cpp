@@ -88,8 +88,11 @@ class Rasterization : public RasterSession {
 }  // namespace
 
 void bind_raster(nb::module_& m) {
-  nb::class_<CameraValues>(m, "RasterCamera", "Pose (world to camera), intrinsics in pixels, near and far.")
-      .def(nb::init<Doubles, Doubles, double, double, double, double, int, int, double, double>());
+  nb::class_<CameraValues>(m, "RasterCamera", "Pose (world to camera), intrinsics in pixels, and the cut rules.")
+      .def(nb::init<Doubles, Doubles, double, double, double, double, int, int, double, double, double, double>(),
+           nb::arg("rotation"), nb::arg("translation"), nb::arg("fx"), nb::arg("fy"), nb::arg("cx"), nb::arg("cy"),
+           nb::arg("width"), nb::arg("height"), nb::arg("near"), nb::arg("far"), nb::arg("min_alpha") = 1.0 / 255,
+           nb::arg("min_transmittance") = 1e-4);
   nb::class_<Rasterization>(m, "Rasterization", "One surfel rasterisation; see rtgs/render/rasterize.py.")
       .def(nb::init<const CameraValues&, bool, bool>(), nb::arg("camera"), nb::arg("normal"), nb::arg("depth"))
       .def("project", &Rasterization::project)

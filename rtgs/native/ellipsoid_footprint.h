@@ -23,7 +23,8 @@ struct EllipsoidFootprint {
     Entry(const float* record, const Tile& tile, const LaneOffsets& offsets, const ForwardArgs& args)
         : record_(record), tile_(tile), offsets_(offsets) {
       const float at_radius = record[Record::kLogOpacity] - args.largest_fall;
-      least_exponent_ = broadcast(at_radius > kLog2MinAlpha ? at_radius : kLog2MinAlpha);
+      const float cut = args.camera.log2_min_alpha;
+      least_exponent_ = broadcast(at_radius > cut ? at_radius : cut);
     }
 
     // Which blocks of the tile meet the bound ellipse.

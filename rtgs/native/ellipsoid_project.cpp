@@ -14,18 +14,18 @@ struct Projection {
 
 Projection project_lanes(const RasterCamera& camera, const EllipsoidSettings& settings, const EllipsoidGeometry& g) {
   Projection out;
-  vmask keep = g.finite_inputs & gt(g.p.z, broadcast(camera.near)) & ge(g.opacity, broadcast(kMinAlpha));
+  vmask keep = g.finite_inputs & gt(g.p.z, broadcast(camera.near)) & ge(g.opacity, broadcast(camera.min_alpha));
   for (const vfloat& scale : g.scales) keep = keep & gt(scale, broadcast(0.f));
   const vfloat opacity = g.opacity * g.compensation;
   const vfloat log_opacity = log2(select(keep, opacity, broadcast(1.f)));
-  const vfloat exact = (log_opacity - kLog2MinAlpha) * (1.f / kHalfLog2E);
+  const vfloat exact = (log_opacity - camera.log2_min_alpha) * (1.f / kHalfLog2E);
   const vfloat reach = max(min(exact, broadcast(settings.largest_radius)), broadcast(0.f));
   const vfloat xx = reach * g.xx, yy = reach * g.yy;
   vfloat bound[kBoundFields];
   conditional_form(xx, yy, reach * g.xy, reach * reach * g.det_dilated, bound);
   const vfloat half_x = sqrt(widened(xx)), half_y = sqrt(widened(yy));
   out.tiles = TileBox(camera, g.mean_x - half_x, g.mean_x + half_x, g.mean_y - half_y, g.mean_y + half_y);
-  keep = keep & out.tiles.meets & ge(opacity, broadcast(kMinAlpha));
+  keep = keep & out.tiles.meets & ge(opacity, broadcast(camera.min_alpha));
   out.depth = g.p.z;
   const vfloat fields[Record::kChannels] = {
       g.mean_x, g.mean_y, g.l0 * kSqrtHalfLog2E, g.l1 * kSqrtHalfLog2E, g.l2 * kSqrtHalfLog2E, log_opacity,

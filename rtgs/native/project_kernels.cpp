@@ -72,10 +72,10 @@ struct Projection {
 
 Projection project_lanes(const RasterCamera& camera, const SurfelGeometry& g) {
   Projection out;
-  vmask keep = g.finite_inputs & gt(g.p.z, broadcast(camera.near)) & ge(g.opacity, broadcast(kMinAlpha)) &
+  vmask keep = g.finite_inputs & gt(g.p.z, broadcast(camera.near)) & ge(g.opacity, broadcast(camera.min_alpha)) &
                gt(g.scale_u, broadcast(0.f)) & gt(g.scale_v, broadcast(0.f));
   vfloat log_opacity = log2(select(keep, g.opacity, broadcast(1.f)));
-  vfloat reach = max((log_opacity - kLog2MinAlpha) * (1.f / kHalfLog2E), broadcast(0.f));
+  vfloat reach = max((log_opacity - camera.log2_min_alpha) * (1.f / kHalfLog2E), broadcast(0.f));
   ScreenBound bound = screen_bound(camera, g, reach);
   out.depth = g.p.z;
   out.depth_scale = g.p.z * g.c[6];

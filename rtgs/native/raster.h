@@ -6,17 +6,16 @@
 namespace rtgs {
 
 constexpr int kTileSide = 16;
-constexpr float kMinAlpha = 1.f / 255.f;
 constexpr float kMaxAlpha = 0.99f;
-constexpr float kMinTransmittance = 1e-4f;
-constexpr float kLog2MinAlpha = -7.99435343685886f;   // log2(1/255)
 constexpr float kHalfLog2E = 0.72134752044448f;       // exp(-rho/2) = 2^(-kHalfLog2E rho)
 
-struct RasterCamera {
+struct RasterCamera {  // a view and its cut rules
   float rotation[9], translation[3];  // world to camera, rows
   float fx, fy, cx, cy;
   int width, height;
   float near, far;
+  float min_alpha, log2_min_alpha;  // a contribution below it is skipped
+  float min_transmittance;          // a pixel stops after the contribution that takes it below
   int tiles_x() const { return (width + kTileSide - 1) / kTileSide; }
   int tiles_y() const { return (height + kTileSide - 1) / kTileSide; }
   int64_t pixels() const { return int64_t(width) * height; }

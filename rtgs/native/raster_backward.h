@@ -69,12 +69,13 @@ void TileBackward<Footprint, C, kExtras>::load_state(const BackwardArgs& args, c
 template <class Footprint, int C, bool kExtras>
 static inline __attribute__((always_inline)) void add_block(const typename Footprint::BackwardFlags& flags,
                                                             const typename Footprint::Entry& gaussian, const float* record,
-                                                            int entry, int block, BlockGradients<C>& state,
+                                                            int entry, int block, vfloat least_transmittance,
+                                                            BlockGradients<C>& state,
                                                             const typename Footprint::ExtraUpstream& extra, vfloat* sums) {
   constexpr int kChannels = Footprint::kChannels, kGradChannels = Footprint::kGradChannels;
   const typename Footprint::Response r = gaussian.respond(block);
   const vfloat transmittance = state.transmittance;
-  const vmask shown = shows(r.exponent, gaussian.least_exponent(), transmittance);
+  const vmask shown = shows(r.exponent, gaussian.least_exponent(), transmittance, least_transmittance);
   const vfloat raw = exp2_response(r.exponent), alpha = min(raw, broadcast(kMaxAlpha));
   const vfloat w = where(shown, alpha * transmittance);
   vfloat to_weight = state.channels[0] * record[kChannels];
@@ -102,6 +103,7 @@ void TileBackward<Footprint, C, kExtras>::run(const BackwardArgs& args, const Ti
   const ForwardArgs& forward = args.forward;
   const LaneOffsets offsets;
   const typename Footprint::BackwardFlags flags(args);
+  const vfloat least_transmittance = broadcast(forward.camera.min_transmittance);
   const int64_t start = forward.tiles.starts[tile.index], count = forward.tiles.used[tile.index];
   const int32_t* ids = forward.tiles.ids + start;
   const uint64_t* masks = forward.tiles.masks + start;
@@ -125,7 +127,7 @@ void TileBackward<Footprint, C, kExtras>::run(const BackwardArgs& args, const Ti
     while (remaining) {
       const int block = __builtin_ctzll(remaining);
       remaining &= remaining - 1;
-      add_block<Footprint, C, kExtras>(flags, gaussian, record, int(entry), block, blocks[block],
+      add_block<Footprint, C, kExtras>(flags, gaussian, record, int(entry), block, least_transmittance, blocks[block],
                                        extras[kExtras ? block : 0], sums);
     }
     float* row = args.rows + layout.gradient_stride * id;

@@ -65,8 +65,8 @@ static inline vfloat least_in_block(const float* bound, vfloat x0, vfloat y0) {
 }
 
 // Lanes whose exponent is not cut and whose pixel has not stopped.
-static inline vmask shows(vfloat exponent, vfloat least_exponent, vfloat transmittance) {
-  return ge(exponent, least_exponent) & ge(transmittance, broadcast(kMinTransmittance));
+static inline vmask shows(vfloat exponent, vfloat least_exponent, vfloat transmittance, vfloat least_transmittance) {
+  return ge(exponent, least_exponent) & ge(transmittance, least_transmittance);
 }
 
 template <int kFloats, int kWrite = 0>

@@ -44,6 +44,7 @@ void TileForward<Footprint, C, kExtras>::composite(const ForwardArgs& args, cons
   constexpr int kChannels = Footprint::kChannels, kFloats = kChannels + C + (kExtras ? Footprint::kExtraFields : 0);
   const LaneOffsets offsets;
   const typename Footprint::ForwardFlags flags(args);
+  const vfloat least_transmittance = broadcast(args.camera.min_transmittance);
   const bool weigh = args.entry_weights != nullptr;
   const int64_t start = args.tiles.starts[tile.index], count = args.tiles.starts[tile.index + 1] - start;
   const int32_t* ids = args.tiles.ids + start;
@@ -70,7 +71,7 @@ void TileForward<Footprint, C, kExtras>::composite(const ForwardArgs& args, cons
         BlockSums<C>& state = sums[block];
         const vfloat transmittance = state.transmittance;
         const typename Footprint::Response r = gaussian.respond(block);
-        vmask shown = shows(r.exponent, gaussian.least_exponent(), transmittance);
+        vmask shown = shows(r.exponent, gaussian.least_exponent(), transmittance, least_transmittance);
         if (!any(shown)) continue;
         shown_blocks |= uint64_t(1) << block;
         vfloat alpha = min(exp2_response(r.exponent), broadcast(kMaxAlpha));
@@ -83,7 +84,7 @@ void TileForward<Footprint, C, kExtras>::composite(const ForwardArgs& args, cons
             Footprint::add_extras(flags, r, record + kChannels + C, w, shown, transmittance, int(entry), extras[block]);
           weight += w;
         }
-        if (!any(ge(after, broadcast(kMinTransmittance)))) live &= ~(uint64_t(1) << block);
+        if (!any(ge(after, least_transmittance))) live &= ~(uint64_t(1) << block);
       }
       masks[entry] = shown_blocks;
       if (kExtras && weigh) args.entry_weights[start + entry] = shown_blocks ? sum(weight) : 0.f;

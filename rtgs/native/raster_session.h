@@ -2,6 +2,7 @@
 #pragma once
 #include <nanobind/stl/optional.h>
 
+#include <cmath>
 #include <optional>
 
 #include "bindings.h"
@@ -27,12 +28,14 @@ inline int whole_lines(int floats) { return (floats + 15) / 16 * 16; }
 struct CameraValues {
   RasterCamera values;
   CameraValues(Doubles rotation, Doubles translation, double fx, double fy, double cx, double cy, int width, int height,
-               double near, double far) {
+               double near, double far, double min_alpha, double min_transmittance) {
     for (int k = 0; k < 9; ++k) values.rotation[k] = float(rotation.data()[k]);
     for (int k = 0; k < 3; ++k) values.translation[k] = float(translation.data()[k]);
     values.fx = float(fx), values.fy = float(fy), values.cx = float(cx), values.cy = float(cy);
     values.width = width, values.height = height;
     values.near = float(near), values.far = float(far);
+    values.min_alpha = float(min_alpha), values.log2_min_alpha = float(std::log2(min_alpha));
+    values.min_transmittance = float(min_transmittance);
   }
 };
 

@@ -17,8 +17,8 @@ struct SurfelFootprint {
   // One surfel in one tile.
   class Entry {
    public:
-    Entry(const float* record, const Tile& tile, const LaneOffsets& offsets, const ForwardArgs&)
-        : record_(record), tile_(tile), offsets_(offsets) {}
+    Entry(const float* record, const Tile& tile, const LaneOffsets& offsets, const ForwardArgs& args)
+        : record_(record), tile_(tile), offsets_(offsets), least_exponent_(args.camera.log2_min_alpha) {}
 
     // Which blocks of the tile meet the surfel's bound ellipse or its low-pass disc.
     uint64_t touched() const {
@@ -52,12 +52,13 @@ struct SurfelFootprint {
       r.exponent = record_[kLogOpacity] - kHalfLog2E * r.rho;
       return r;
     }
-    vfloat least_exponent() const { return broadcast(kLog2MinAlpha); }
+    vfloat least_exponent() const { return broadcast(least_exponent_); }
 
    private:
     const float* record_;
     const Tile& tile_;
     const LaneOffsets& offsets_;
+    float least_exponent_;
   };
 
   // ---- forward: the optional outputs ---------------------------------------------------------------------------

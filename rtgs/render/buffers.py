@@ -15,6 +15,8 @@ class RasterOptions:
 
     near: float = 0.2  # world units: surfels with a centre at or before it are culled, hits before it do not count
     far: float = 100.0  # world units: only the distortion's depth mapping uses it
+    transmittance_cutoff: float = 1e-4  # a pixel stops after the surfel that takes T below it (kernels.md, Semantics)
+    alpha_cutoff: float = 1 / 255  # a contribution with less alpha is skipped; it also bounds a surfel's support
     depth: bool = False
     median_depth: bool = False
     normal: bool = False

@@ -5,7 +5,7 @@ Used by tests and benchmarks that compare the native rasteriser with its twin (d
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -13,11 +13,9 @@ from torch import Tensor
 from rtgs.cameras import Camera
 from rtgs.render.buffers import RasterOptions
 from rtgs.render.reference import (
-    ALPHA_CUT,
     ALPHA_MAX,
     DEFAULT_OPTIONS,
     MEDIAN_TRANSMITTANCE,
-    TRANSMITTANCE_CUT,
     PixelDecisions,
     ProjectedSurfels,
     decide,
@@ -32,7 +30,7 @@ from rtgs.render.reference import (
 class DiscontinuityBands:
     """How near a threshold is "on" it."""
 
-    alpha: float = 1e-4  # of alpha_raw to 1/255 and to the clamp
+    alpha: float = 1e-4  # of alpha_raw to its cutoff and to the clamp
     transmittance: float = 1e-4  # relative, of T to its cutoff and to 0.5
     rho: float = 1e-3  # of rho_plane to rho_disc, relative to 1 + rho
     hit_depth: float = 1e-4  # relative, of a visible hit to the near plane
@@ -64,10 +62,8 @@ def discontinuity_mask(
     """
     local = camera.to_camera(means)
     rounding = bands.depth * depth_terms(means, camera)
-    near = options.near - rounding
-    keep = kept_surfels(
-        local, tangent_u, tangent_v, scales, opacities, features, near, opacity_cut=ALPHA_CUT - bands.alpha
-    )
+    near, alpha_cut = options.near - rounding, options.alpha_cutoff - bands.alpha
+    keep = kept_surfels(local, tangent_u, tangent_v, scales, opacities, features, near, opacity_cut=alpha_cut)
     surfels = project(local, means, tangent_u, tangent_v, scales, opacities, features, camera, keep)
     rounding = rounding[keep]
     fragile = (surfels.depth - options.near).abs() <= rounding
@@ -76,9 +72,9 @@ def discontinuity_mask(
     flags = []
     for chunk in pixel_chunks(pixel_centers(camera, means), len(keep)):
         # a hit just before the near plane is evaluated too, so that what it would show is flagged
-        decisions = decide(surfels, chunk, options.near * (1 - bands.hit_depth))
-        met = decisions.transmittance >= TRANSMITTANCE_CUT * (1 - bands.transmittance)
-        drawn = met & (decisions.alpha_raw >= ALPHA_CUT - bands.alpha)
+        decisions = decide(surfels, chunk, replace(options, near=options.near * (1 - bands.hit_depth)))
+        met = decisions.transmittance >= options.transmittance_cutoff * (1 - bands.transmittance)
+        drawn = met & (decisions.alpha_raw >= alpha_cut)
         flagged = drawn & (on_threshold(surfels, decisions, options, bands) | fragile)
         flagged |= swapped_order(drawn, surfels.depth, rounding, means[keep], camera)
         flags.append(flagged.any(1))
@@ -102,11 +98,11 @@ def on_threshold(
 ) -> Tensor:
     """(P, K) bool: a decision about this surfel at this pixel is within its band."""
     alpha, before = decisions.alpha_raw, decisions.transmittance
-    after = before * (1 - torch.where(alpha >= ALPHA_CUT, alpha.clamp_max(ALPHA_MAX), 0.0))
+    after = before * (1 - torch.where(alpha >= options.alpha_cutoff, alpha.clamp_max(ALPHA_MAX), 0.0))
     rho = torch.minimum(decisions.rho_plane, decisions.rho_disc)
-    flagged = (alpha - ALPHA_CUT).abs() <= bands.alpha
+    flagged = (alpha - options.alpha_cutoff).abs() <= bands.alpha
     flagged |= (alpha - ALPHA_MAX).abs() <= bands.alpha
-    flagged |= (after / TRANSMITTANCE_CUT - 1).abs() <= bands.transmittance
+    flagged |= (after / options.transmittance_cutoff - 1).abs() <= bands.transmittance
     flagged |= (decisions.rho_plane - decisions.rho_disc).abs() <= bands.rho * (1 + rho)
     flagged |= (decisions.hit_depth - options.near).abs() <= bands.hit_depth * options.near
     if options.median_depth:

@@ -10,11 +10,13 @@ from rtgs.cameras import Camera
 from rtgs.native import core
 
 
-def native_camera(camera: Camera, near: float, far: float) -> core.RasterCamera:
-    """Pose, intrinsics and planes (world units) of one view."""
+def native_camera(
+    camera: Camera, near: float, far: float, cutoffs: tuple[float, float] = (1 / 255, 1e-4)
+) -> core.RasterCamera:
+    """Pose, intrinsics and planes (world units) of one view, and the cutoffs of alpha and transmittance."""
     c = camera
     rotation, translation = c.rotation.contiguous().numpy(), c.translation.contiguous().numpy()
-    return core.RasterCamera(rotation, translation, c.fx, c.fy, c.cx, c.cy, c.width, c.height, near, far)
+    return core.RasterCamera(rotation, translation, c.fx, c.fy, c.cx, c.cy, c.width, c.height, near, far, *cutoffs)
 
 
 def as_array(tensor: Tensor | None) -> np.ndarray | None:

@@ -43,7 +43,7 @@ def rasterize_surfels(
         features: (N, C), 1 <= C <= 32.
         camera: pinhole camera; not differentiated.
         background: (C,) composited behind everything; None is black. Not differentiated.
-        options: optional outputs, near and far plane.
+        options: optional outputs, near and far plane, cutoffs.
         screen_probe: (N, 2), any values: its gradient receives the densification signal (methods.md 3.1).
 
     Raises:
@@ -86,7 +86,9 @@ class _Rasterize(torch.autograd.Function):
         options, width, height = call.options, call.camera.width, call.camera.height
         arrays = [as_array(t) for t in (means, tangent_u, tangent_v, scales, opacities, features)]
         needs_depth = options.depth or options.median_depth or options.distortion
-        native = core.Rasterization(native_camera(call.camera, options.near, options.far), options.normal, needs_depth)
+        cutoffs = (options.alpha_cutoff, options.transmittance_cutoff)
+        camera = native_camera(call.camera, options.near, options.far, cutoffs)
+        native = core.Rasterization(camera, options.normal, needs_depth)
         native.project(*arrays, call.threads)
 
         image = torch.empty(features.shape[1], height, width, dtype=torch.float32)
@@ -141,4 +143,7 @@ class _Rasterize(torch.autograd.Function):
 def _check_options(options: RasterOptions, camera: Camera) -> None:
     if not 0 < options.near < options.far:
         raise ValueError(f"near={options.near} and far={options.far} must satisfy 0 < near < far (world units)")
+    for name in ("alpha_cutoff", "transmittance_cutoff"):
+        if not 0 < getattr(options, name) < 0.99:
+            raise ValueError(f"{name}={getattr(options, name)} must be above 0 and below 0.99, the largest alpha")
     check_size(camera)

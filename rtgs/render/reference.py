@@ -23,9 +23,9 @@ from rtgs.cameras import Camera
 from rtgs.render.arguments import check_shapes
 from rtgs.render.buffers import RasterBuffers, RasterOptions
 
-ALPHA_CUT = 1 / 255  # a contribution below it is skipped (Kerbl et al. 2023; methods.md 3.1)
+ALPHA_CUT = 1 / 255  # the default: a contribution below it is skipped (Kerbl et al. 2023; methods.md 3.1)
 ALPHA_MAX = 0.99  # keeps 1 / (1 - alpha) <= 100 (methods.md 14)
-TRANSMITTANCE_CUT = 1e-4  # a pixel stops after the surfel that takes it below
+TRANSMITTANCE_CUT = 1e-4  # the default: a pixel stops after the surfel that takes it below
 MEDIAN_TRANSMITTANCE = 0.5
 DEFAULT_OPTIONS = RasterOptions()
 PAIRS_PER_CHUNK = 1 << 20  # surfel-pixel pairs evaluated at once: bounds memory
@@ -82,7 +82,7 @@ def rasterize_surfels(
         features: (N, C), 1 <= C <= 32.
         camera: not differentiated.
         background: (C,) added behind everything; None is black.
-        options: optional outputs, near and far.
+        options: optional outputs, near and far, cutoffs.
         screen_probe: (N, 2) whose gradient receives the densification signal (methods.md 3.1); its value is ignored.
 
     Raises:
@@ -92,7 +92,9 @@ def rasterize_surfels(
     local = camera.to_camera(means)
     if screen_probe is not None:
         local = attach_probe(local, screen_probe, camera)
-    keep = kept_surfels(local, tangent_u, tangent_v, scales, opacities, features, options.near)
+    keep = kept_surfels(
+        local, tangent_u, tangent_v, scales, opacities, features, options.near, opacity_cut=options.alpha_cutoff
+    )
     surfels = project(local, means, tangent_u, tangent_v, scales, opacities, features, camera, keep)
     pixels = pixel_centers(camera, means)
 
@@ -232,22 +234,22 @@ def transmittance_before(alpha: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def decide(surfels: ProjectedSurfels, pixels: Tensor, near: float) -> PixelDecisions:
+def decide(surfels: ProjectedSurfels, pixels: Tensor, options: RasterOptions) -> PixelDecisions:
     """Branch, cut and stop of every pixel (P, 2) and surfel (docs/rasterizer.md, "Per surfel and pixel")."""
     offset = pixels[:, None] - surfels.center
     numerator, denominator = ray_plane(surfels, offset)
     ahead = (surfels.determinant > 0) & (denominator > 0)  # det A and D of one sign: in front of the camera
     safe = torch.where(ahead, denominator, 1.0)
     hit_depth = torch.where(ahead, surfels.depth * surfels.determinant / safe, 0.0)
-    counts = ahead & (hit_depth >= near)
+    counts = ahead & (hit_depth >= options.near)
     rho_plane = torch.where(counts, (numerator / safe.unsqueeze(-1)).square().sum(-1), torch.inf)
     rho_disc = 2 * offset.square().sum(-1)
     alpha_raw = surfels.opacity * torch.exp(-0.5 * torch.minimum(rho_plane, rho_disc))
-    visible = alpha_raw >= ALPHA_CUT
+    visible = alpha_raw >= options.alpha_cutoff
     before = transmittance_before(torch.where(visible, alpha_raw.clamp_max(ALPHA_MAX), 0.0))[:, :-1]
     return PixelDecisions(
         plane=rho_plane < rho_disc,
-        contributes=visible & (before >= TRANSMITTANCE_CUT),
+        contributes=visible & (before >= options.transmittance_cutoff),
         transmittance=before,
         alpha_raw=alpha_raw,
         rho_plane=rho_plane,
@@ -278,7 +280,7 @@ def composite(surfels: ProjectedSurfels, pixels: Tensor, options: RasterOptions)
     Returns (P, C + 7): features without background, alpha, depth, median depth, distortion, normal; and the
     detached sum of weights (K,).
     """
-    decisions = decide(surfels, pixels, options.near)
+    decisions = decide(surfels, pixels, options)
     alpha, depth = alpha_and_depth(surfels, pixels, decisions)
     transmittance = transmittance_before(alpha)
     weight = alpha * transmittance[:, :-1]

@@ -21,6 +21,7 @@ from benchmarks import (
     optics_gain,
     raster,
     raster_ellipsoids,
+    raster_levers,
     sfm,
     speed_error,
     trace,
@@ -112,6 +113,21 @@ def test_speed_error_of_the_tracer(run, tmp_path: Path) -> None:
     for lever, default in trace_levers.defaults().items():
         assert any(p["setting"] == default for p in points if p["lever"] == lever), "the default is among the settings"
     assert (tmp_path / "speed_error_tracer.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_speed_error_of_the_rasterizer(run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(raster_levers, "WIDTH", 80)
+    monkeypatch.setattr(raster_levers, "HEIGHT", 60)
+    figures = run(speed_error, "--quick", "--parts", "rasterizer", "--rounds", "2", "--output", str(tmp_path))
+    points = figures["rasterizer"]["points"]
+    assert {point["lever"] for point in points} == {"transmittance_cutoff", "alpha_cutoff", "resolution"}
+    for lever, default in raster_levers.defaults().items():
+        own = [point for point in points if point["lever"] == lever]
+        assert own[0]["setting"] == default, "the default comes first"
+        errors = [-math.inf if point["psnr"] is None else -point["psnr"] for point in own]
+        assert errors == sorted(errors), "a looser cut is less exact"
+        assert all(point["ms"] > 0 for point in own)
+    assert (tmp_path / "speed_error_rasterizer.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_speed_error_end_to_end(run, tmp_path: Path) -> None:

@@ -53,6 +53,21 @@ def test_maps_that_need_a_surface_are_refused():
     assert buffers.normal is None
 
 
+def test_antialiasing_is_a_setting_that_training_and_test_views_obey():
+    settings = replace(ELLIPSOIDS, render=replace(ELLIPSOIDS.render, antialiased=True))
+    method, scene = make(settings)
+    plain, _ = make(ELLIPSOIDS)
+    view = scene.train[0]
+    for other in (method, plain):
+        with torch.no_grad():
+            other.sets[0].surfels.log_scales.sub_(3.0)  # below a pixel: dilation would widen them
+    for options in (None, RenderOptions()):
+        faint, whole = (other.render(view.camera, 0, options).buffers.alpha.detach() for other in (method, plain))
+        assert 0 < float(faint.sum()) < 0.9 * float(whole.sum())
+    method.losses(method.render(view.camera, 0), view, 0).total.backward()
+    assert bool(method.sets[0].surfels.log_scales.grad.any())
+
+
 def test_ablations_without_an_object_are_refused():
     with pytest.raises(RtgsError, match="ablation=no_normal_loss takes nothing away from method 3dgs: it is for 2dgs"):
         compose(["scene=demo", "method=3dgs", "ablation=no_normal_loss"])

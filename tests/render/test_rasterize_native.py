@@ -223,6 +223,10 @@ def test_wrong_options_are_named():
     scene = native_scene(10, 20, 20, 3)
     with pytest.raises(ValueError, match=r"near=2\.0 and far=1\.0"):
         scene.render(RasterOptions(near=2.0, far=1.0))
+    with pytest.raises(ValueError, match=r"alpha_cutoff=1.5 must be above 0"):
+        scene.render(RasterOptions(alpha_cutoff=1.5))
+    with pytest.raises(ValueError, match=r"transmittance_cutoff=0.0 must be above 0"):
+        scene.render(RasterOptions(transmittance_cutoff=0.0))
     with pytest.raises(ValueError, match="background must have shape"):
         rasterize_surfels(*scene.tensors, scene.camera, background=torch.zeros(4))
     with pytest.raises(ValueError, match="screen_probe must have shape"):

@@ -6,14 +6,17 @@ three ill-conditioned kinds that holds for all but 1e-2 of the gradient elements
 on a discontinuity are flagged, counted, and given no upstream gradient.
 """
 
+from dataclasses import replace
+
 import pytest
 import torch
 from hypothesis import given, settings
 
 from rtgs.render.rasterize import rasterize_surfels
 
-from .strategies import DEGENERATE, Recipe, recipes
-from .twin_runs import Pools, expected, rounded, run
+from .scenes import ALL_OUTPUTS
+from .strategies import DEGENERATE, Recipe, build, recipes
+from .twin_runs import Pools, answer, expected, rounded, run
 
 PIXEL_TOLERANCE, PIXEL_SHARE = 1e-5, 1e-3
 GRADIENT_TOLERANCE = 1e-4
@@ -72,6 +75,24 @@ def test_crowded_picture(isa: str):
     pools = Pools()
     pools.add(run(rasterize_surfels, answer.scene, torch.float32, answer.upstream), answer)
     assert pools.flagged_share < 0.5
+    for name, pool in pools.pictures.items():
+        assert pool.share_beyond(PIXEL_TOLERANCE) <= PIXEL_SHARE, f"{name}: worst {pool.worst:.1e}"
+    for name, pool in pools.gradients.items():
+        assert pool.worst <= GRADIENT_TOLERANCE, name
+
+
+CUTOFFS = {"loose": (1 / 32, 1e-2), "tight": (1 / 2000, 1e-6), "alpha alone": (1 / 16, 1e-4)}
+
+
+@pytest.mark.parametrize(("alpha", "transmittance"), CUTOFFS.values(), ids=CUTOFFS)
+@pytest.mark.parametrize("kind", ["ordinary", "crowded"])
+def test_other_cutoffs(isa: str, kind: str, alpha: float, transmittance: float):
+    options = replace(ALL_OUTPUTS, alpha_cutoff=alpha, transmittance_cutoff=transmittance)
+    pools = Pools()
+    for seed in range(3):
+        found = answer(build(Recipe(kind, seed, 80, 33, 25, 6)), seed, options)
+        pools.add(run(rasterize_surfels, found.scene, torch.float32, found.upstream, options), found)
+    assert pools.flagged_share < 0.7  # a tight cutoff lets many more surfels be met, each with its own thresholds
     for name, pool in pools.pictures.items():
         assert pool.share_beyond(PIXEL_TOLERANCE) <= PIXEL_SHARE, f"{name}: worst {pool.worst:.1e}"
     for name, pool in pools.gradients.items():

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from rtgs.render import reference
-from rtgs.render.buffers import RasterBuffers
+from rtgs.render.buffers import RasterBuffers, RasterOptions
 from rtgs.render.discontinuities import discontinuity_mask
 
 from .comparison import ErrorPool, pixel_error, relative_error
@@ -40,12 +40,18 @@ class Expected:
     exact: Run
 
 
-def run(rasterizer: Rasterizer, scene: SurfelScene, dtype: torch.dtype, upstream: dict[str, Tensor]) -> Run:
+def run(
+    rasterizer: Rasterizer,
+    scene: SurfelScene,
+    dtype: torch.dtype,
+    upstream: dict[str, Tensor],
+    options: RasterOptions = ALL_OUTPUTS,
+) -> Run:
     """Render all outputs and pull ``upstream`` back to the inputs."""
     leaves = scene.surfels.leaves(dtype).all()
     probe = torch.zeros(len(leaves[0]), 2, dtype=dtype, requires_grad=True)
     background = None if scene.background is None else scene.background.to(dtype)
-    buffers = rasterizer(*leaves, scene.camera, background=background, options=ALL_OUTPUTS, screen_probe=probe)
+    buffers = rasterizer(*leaves, scene.camera, background=background, options=options, screen_probe=probe)
     pictures = {name: output(buffers, name) for name in OUTPUTS}
     loss = torch.stack([(pictures[name] * upstream[name].to(dtype)).sum() for name in OUTPUTS]).sum()
     gradients = torch.autograd.grad(loss, (*leaves, probe))
@@ -56,14 +62,15 @@ def run(rasterizer: Rasterizer, scene: SurfelScene, dtype: torch.dtype, upstream
     )
 
 
-def answer(scene: SurfelScene, seed: int = 0) -> Expected:
+def answer(scene: SurfelScene, seed: int = 0, options: RasterOptions = ALL_OUTPUTS) -> Expected:
     """The twin's pictures and gradients for random upstream gradients, zero on flagged pixels."""
     exact = tuple(tensor.double() for tensor in scene.surfels.all())
-    flagged = discontinuity_mask(*exact, scene.camera, options=ALL_OUTPUTS)
+    flagged = discontinuity_mask(*exact, scene.camera, options=options)
     generator = torch.Generator().manual_seed(seed)
     shapes = dict.fromkeys(OUTPUTS, ()) | {"features": (scene.surfels.features.shape[1],), "normal": (3,)}
     upstream = {name: torch.randn(*shapes[name], *flagged.shape, generator=generator) * ~flagged for name in OUTPUTS}
-    return Expected(scene, flagged, upstream, run(reference.rasterize_surfels, scene, torch.float64, upstream))
+    exact_run = run(reference.rasterize_surfels, scene, torch.float64, upstream, options)
+    return Expected(scene, flagged, upstream, exact_run)
 
 
 @cache
