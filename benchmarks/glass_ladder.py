@@ -1,12 +1,15 @@
 """What each piece of knowledge about a transparent object is worth: from its true surface down to the paper's own way.
 
-``python -m benchmarks.glass_ladder [--scenes ball_statue tall_bottle] [--rungs NAME ...] [--preset quick]``
+``python -m benchmarks.glass_ladder [--scenes ball_statue tall_bottle] [--rungs GROUP|NAME ...] [--preset quick]``
 
 Every rung is a run of the pipeline (`rtgs run`) on a path-traced scene; what rungs share is trained once, and what the
-store holds is not run again: stopped at any time, the same command goes on. Every eighth training view is held out and
-judged beside the test views: choose by those, the test views are only reported. *Bright* pixels are masked pixels of
-the test views whose true reflected layer (sRGB encoded, mean of the channels) is above the view's 90th percentile
-within its mask. A Markdown table is written as it grows; last line: a JSON object.
+store holds is not run again: stopped at any time, the same command goes on. `--size small`, the default, is the preset
+at 128x96 pixels and half its steps, every start of a stage, interval and cap in proportion (SMALL); `--size preset`
+leaves it alone. Every eighth training view is held out and judged beside the test views: choose by those, the test
+views are only reported. *Bright* pixels are masked pixels of the test views (training views have no truth) whose true
+reflected layer (sRGB encoded, mean of the channels) is above the view's 90th percentile within its mask. Depth and
+normal: share of the test views' masked pixels within 3 % and 15 degrees of the true first surface, where the third
+stage begins and of the final pictures. A Markdown table is written as it grows; last line: a JSON object.
 """
 
 from __future__ import annotations
@@ -31,6 +34,16 @@ if TYPE_CHECKING:
     from rtgs.config.schema import RunConfig
     from rtgs.scenes.scene import View
 
+SMALL = (
+    *("scene.long_side=128", "schedule.total=1000", "schedule.means_lr_steps=1000", "schedule.sh_every=250"),
+    *("schedule.densify_from=100", "schedule.densify_until=750", "schedule.densify_every=50"),
+    *("method.density.max_surfels=10000", "method.reflection.cells=10", "method.reflection.sh_every=150"),
+    *("method.reflection.densify_every=50", "method.reflection.density.max_surfels=6000"),
+    *("method.transmittance.sh_every=150", "method.transmittance.densify_from=50"),
+    *("method.transmittance.densify_every=50", "method.transmittance.density.max_surfels=6000"),
+    *("method.transmittance.interface.count=2000", "method.loss.perceptual=0"),
+)
+"""Half of quick's steps on a quarter of its pixels."""
 BRIGHT = 0.9  # quantile of the true reflected layer in the mask
 _T = "method.transmittance"
 _I = f"{_T}.interface"
@@ -58,44 +71,72 @@ def _given(setting: Setting) -> list[str]:
     return ["mesh.source=given", f"mesh.object.given={setting.truth}"]
 
 
-RUNGS: dict[str, Rung] = {
+def _hull(*words: str) -> Callable[[Setting, RunConfig], list[str]]:
+    return lambda *_: ["ablation=mesh_hull", *words]
+
+
+def _paper(*words: str) -> Callable[[Setting, RunConfig], list[str]]:
+    return lambda *_: ["ablation=paper_glass", "mesh.source=tsdf", *words]
+
+
+_UNBOUNDED = (f"{_T}.rim=0", f"{_T}.max_weight=0")
+_ALL_GLASS = (f"{_I}.masked_share=0", f"{_T}.keep_seen=0")
+LADDER: dict[str, Rung] = {
     "truth": Rung("true mesh, true normals held fixed", lambda s, _: [*_given(s), f"{_T}.normal=mesh"]),
     "truth_mesh": Rung("true mesh, normals learned", lambda s, _: _given(s)),
-    "hull": Rung("hull of the masks (default)", lambda *_: ["ablation=mesh_hull"]),
+    "hull": Rung("hull of the masks (default)", _hull()),
+    "hull_fixed": Rung("hull, its normals held fixed", _hull(f"{_T}.normal=mesh")),
     "tsdf": Rung("TSDF of the base set", lambda *_: ["ablation=mesh_tsdf"]),
     "two_stages": Rung("no third stage", lambda *_: ["ablation=two_stages"]),
-    "paper": Rung("the paper's way", lambda *_: ["ablation=paper_glass", "mesh.source=tsdf"]),
+    "paper": Rung("the paper's way: full second stage, no interface, TSDF", _paper()),
+    "paper_propagation": Rung("the paper's way, normal propagation", lambda _, c: _paper()(_, c) + _propagation(c)),
     "paper_early_specular": Rung(
         "the paper's way, L_spec from the second stage on",
-        lambda _, c: [
-            "ablation=paper_glass",
-            "mesh.source=tsdf",
-            f"method.loss.specular_start={c.method.reflection.start}",
-        ],
+        lambda _, c: _paper(f"method.loss.specular_start={c.method.reflection.start}")(_, c),
     ),
     "paper_mono_in_mask": Rung(
         "the paper's way, L_mono of weight 0.2 in the mask",
-        lambda _, c: ["ablation=paper_glass", "mesh.source=tsdf", f"method.loss.mono_normal_masked={_masked_gain(c)}"],
+        lambda _, c: _paper(f"method.loss.mono_normal_masked={_masked_gain(c)}")(_, c),
+    ),
+    "paper_early_third": Rung(
+        "the paper's way, third stage right after the second begins",
+        lambda _, c: _paper(f"{_T}.start={c.method.reflection.start + 0.05:g}")(_, c),
     ),
     "early_third_stage": Rung(
         "hull, third stage right after the second begins",
-        lambda _, c: ["ablation=mesh_hull", f"{_T}.start={c.method.reflection.start + 0.05:g}"],
+        lambda _, c: _hull(f"{_T}.start={c.method.reflection.start + 0.05:g}")(_, c),
     ),
     "early_specular": Rung(
         "hull, L_spec from the second stage on",
-        lambda _, c: ["ablation=mesh_hull", f"method.loss.specular_start={c.method.reflection.start}"],
+        lambda _, c: _hull(f"method.loss.specular_start={c.method.reflection.start}")(_, c),
     ),
-    "faint_start": Rung("hull, w_r from 0.25", lambda *_: ["ablation=mesh_hull", f"{_I}.f0=0.05"]),
-    "no_rim": Rung("hull, no rim", lambda *_: ["ablation=mesh_hull", f"{_T}.rim=0"]),
-    "no_bound": Rung("hull, w_r not bounded", lambda *_: ["ablation=mesh_hull", f"{_T}.max_weight=0"]),
-    "all_glass": Rung(
-        "hull, all of it glass",
-        lambda *_: ["ablation=mesh_hull", f"{_I}.masked_share=0", f"{_T}.keep_seen=0"],
-    ),
-    "growing_base": Rung("hull, density control goes on", lambda *_: ["ablation=mesh_hull", f"{_T}.freeze_base=false"]),
+    "normal_loss_0": Rung("hull, no normal loss", _hull(f"{_I}.normal_loss=0")),
+    "normal_loss_05": Rung("hull, normal loss 0.05", _hull(f"{_I}.normal_loss=0.05")),
+    "normal_loss_1": Rung("hull, normal loss 1 (default 0.2)", _hull(f"{_I}.normal_loss=1")),
 }
-LADDER = tuple(RUNGS)[:10]
-"""What is run when no rung is named; the others are choices of the default rung, one by one."""
+CHOICES: dict[str, Rung] = {
+    "before_all_glass": Rung("hull, no rim, w_r not bounded, all of it glass", _hull(*_UNBOUNDED, *_ALL_GLASS)),
+    "before": Rung("hull, no rim, w_r not bounded", _hull(*_UNBOUNDED)),
+    "before_faint": Rung("hull, no rim, w_r not bounded but from 0.25", _hull(*_UNBOUNDED, f"{_I}.f0=0.05")),
+    "no_rim": Rung("hull, no rim", _hull(f"{_T}.rim=0")),
+    "no_bound": Rung("hull, w_r not bounded", _hull(f"{_T}.max_weight=0")),
+    "all_glass": Rung("hull, all of it glass", _hull(*_ALL_GLASS)),
+    "faint_start": Rung("hull, w_r from 0.25", _hull(f"{_I}.f0=0.05")),
+    "growing_base": Rung("hull, density control of the base set goes on", _hull(f"{_T}.freeze_base=false")),
+}
+RUNGS = LADDER | CHOICES
+GROUPS: dict[str, tuple[str, ...]] = {
+    "ladder": tuple(LADDER),
+    "choices": (*CHOICES, "hull", "two_stages"),
+}
+"""Names for several rungs: the ladder, and the choices of the default rung that docs/transmittance.md names."""
+
+
+def _propagation(config: RunConfig) -> list[str]:
+    """EnvGS's normal propagation in the second stage: a twenty-fifth of the run apart, as rests of it in proportion."""
+    words = {"every": max(1, config.schedule.total // 25), "hold_every": max(1, config.schedule.total // 125)}
+    words |= {"until": config.method.transmittance.start, "densify_every": config.schedule.densify_every}
+    return [f"method.reflection.propagation.{key}={value}" for key, value in words.items()]
 
 
 def _masked_gain(config: RunConfig) -> float:
@@ -115,9 +156,9 @@ class Measured:
     ssim_masked: float
     psnr_bright: float
     depth_before: float | None
-    depth_after: float | None
+    depth_after: float
     normal_before: float | None
-    normal_after: float | None
+    normal_after: float
     silhouette_iou: float | None
     seconds: float | None  # CPU, of the third stage
 
@@ -153,13 +194,18 @@ def prepare(scene: str, arguments: argparse.Namespace) -> Setting:
 def base_config(scene: str, arguments: argparse.Namespace) -> RunConfig:
     from rtgs.config.compose import compose
 
-    return compose([f"scene={scene}", "method=rtgs", f"preset={arguments.preset}", *arguments.set])[0]
+    return compose([f"scene={scene}", "method=rtgs", f"preset={arguments.preset}", *sized(arguments)])[0]
+
+
+def sized(arguments: argparse.Namespace) -> list[str]:
+    """The words beside scene, method, preset and seed."""
+    return [*(SMALL if arguments.size == "small" else ()), *arguments.set]
 
 
 def run(name: str, setting: Setting, arguments: argparse.Namespace) -> Measured | str:
     """Run the rung, or find it done; a string is why it failed."""
     words = [f"scene={setting.scene}", "method=rtgs", f"preset={arguments.preset}", f"seed={arguments.seed}"]
-    words += [f"scene.split_file={setting.split}", "evaluation.lpips=false", *arguments.set]
+    words += [f"scene.split_file={setting.split}", "evaluation.lpips=false", *sized(arguments)]
     words += RUNGS[name].words(setting, base_config(setting.scene, arguments))
     words += [f"name={setting.scene}-{name}", f"threads={arguments.threads}", "tracking=off"]
     done = subprocess.run(
@@ -184,22 +230,21 @@ def read(root: Path, name: str, held_out: Sequence[str]) -> Measured:
     def mean(metric: str, *, judged: bool) -> float:
         return statistics.fmean(row["values"][metric] for row in rows if (row["view"] in held_out) == judged)
 
-    boundary: dict[str, dict[str, float | None]] = {"before": {}, "after": {}}
+    before: dict[str, float | None] = {}
     seconds = None
     if third := places.get("train_transmittance"):
-        boundary = json.loads((third / "boundary.json").read_text(encoding="utf-8"))
+        before = json.loads((third / "boundary.json").read_text(encoding="utf-8"))["before"]
         spent = [_summary(place)["cpu_seconds"] for place in (third, places["train_reflection"])]
         seconds = spent[0] - spent[1]
-    before, after = boundary["before"], boundary["after"]
     figures: list[Any] = [
         mean("psnr", judged=True),
         mean("psnr_masked", judged=True),
         *(mean(metric, judged=False) for metric in ("psnr", "ssim", "psnr_masked", "ssim_masked")),
         bright_psnr(places),
         before.get("depth_share"),
-        after.get("depth_share"),
+        mean("depth_share_masked", judged=False),
         before.get("normal_share"),
-        after.get("normal_share"),
+        mean("normal_share_masked", judged=False),
         before.get("silhouette_iou"),
         seconds,
     ]
@@ -253,7 +298,7 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     rows, figures, failures = [], [], []
     for scene in arguments.scenes:
         setting = prepare(scene, arguments)
-        for name in arguments.rungs:
+        for name in named(arguments.rungs):
             found = run(name, setting, arguments)
             if isinstance(found, str):
                 failures.append(f"{scene}, {name}: {found}")
@@ -267,9 +312,15 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     return {"machine": machine(), "preset": arguments.preset, "figures": figures, "failures": failures}
 
 
+def named(words: Sequence[str]) -> list[str]:
+    """The rungs of groups and names, each once, in order."""
+    return list(dict.fromkeys(name for word in words for name in GROUPS.get(word, (word,))))
+
+
 def write(arguments: argparse.Namespace, rows: Sequence[Sequence[str]], failures: Sequence[str]) -> None:
     """The table so far, with the command that makes it."""
-    words = f"--preset {arguments.preset} --scenes {' '.join(arguments.scenes)} --rungs {' '.join(arguments.rungs)}"
+    words = f"--preset {arguments.preset} --size {arguments.size} --scenes {' '.join(arguments.scenes)} "
+    words += f"--rungs {' '.join(arguments.rungs)}"
     words += f" --set {' '.join(arguments.set)}" if arguments.set else ""
     text = f"`python -m benchmarks.glass_ladder {words}`\n\n{table(rows)}"
     text += "".join(f"\n- failed: {failure}" for failure in failures)
@@ -282,7 +333,9 @@ def parse() -> argparse.Namespace:
     add = parser.add_argument
     add("--preset", default="quick")
     add("--scenes", nargs="+", default=["ball_statue", "tall_bottle"])
-    add("--rungs", nargs="+", default=list(LADDER), choices=list(RUNGS), metavar="NAME", help=", ".join(RUNGS))
+    every = [*GROUPS, *RUNGS]
+    add("--rungs", nargs="+", default=["ladder"], choices=every, metavar="NAME", help=", ".join(every))
+    add("--size", default="small", choices=("small", "preset"), help="small: 128 pixels, 1,000 steps; preset: as it is")
     add("--seed", type=int, default=0)
     add("--threads", type=int, default=1)
     add("--root", type=Path, default=Path("benchmarks/results/glass"), help="folder of store and runs")

@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
 
+import numpy as np
+
+from pipelines.extract_mesh import SUMMARY_FILE
 from pipelines.render import read_timed
 from pipelines.training import last_training, read_summary
 from rtgs.config.schema import EvaluationConfig
 from rtgs.pipeline import StepContext, StepKind
+
+if TYPE_CHECKING:
+    from rtgs.evaluate.surface import ObjectFacts
+    from rtgs.scenes.scene import Scene
 
 TABLE_JSON = "metrics.json"
 TABLE_CSV = "metrics.csv"
@@ -15,6 +25,7 @@ TRACKED = (  # means over the test views that go to the tracker, where they are 
     *("psnr", "ssim", "lpips_01", "psnr_masked", "ssim_masked", "lpips_01_masked", "psnr_specular"),
     *("psnr_reflection", "psnr_reflection_scaled", "psnr_transmission", "psnr_transmission_scaled"),
     *("psnr_given_masks", "psnr_masked_given_masks", "ssim_masked_given_masks"),
+    *("depth_error_masked", "depth_share_masked", "normal_degrees_masked", "normal_share_masked"),
 )
 
 
@@ -52,9 +63,10 @@ def evaluate(params: EvaluateParams, context: StepContext) -> None:
         train_seconds=summary["seconds"],  # pyright: ignore[reportArgumentType]
         train_cpu_seconds=summary["cpu_seconds"],  # pyright: ignore[reportArgumentType]
     )
-    renders = [read_timed(context.inputs["render"], view.name) for view in scene.test]
+    renders = [read_timed(context.inputs["render"], view.name, view.camera) for view in scene.test]
     settings = EvaluationSettings(params.evaluation.lpips, params.evaluation.masked, params.evaluation.eight_bit)
-    table = evaluate_views(renders, scene.test, facts, settings)
+    known = object_facts(context.inputs["extract_mesh"], scene) if "extract_mesh" in context.inputs else None
+    table = evaluate_views(renders, scene.test, facts, settings, object_facts=known)
     write_json(context.out / TABLE_JSON, table)
     write_csv(context.out / TABLE_CSV, table)
     write_error_maps(renders, scene.test, context.out / "errors")
@@ -62,15 +74,48 @@ def evaluate(params: EvaluateParams, context: StepContext) -> None:
     context.tracker.table("eval", rows)
     means = {name: table.mean(name) for name in TRACKED}
     context.tracker.metrics({f"eval/{name}": value for name, value in means.items() if value is not None})
+    if known is not None:
+        context.log.info("guide of the object's mesh: %s", known.fallbacks)
+        context.tracker.metrics({f"object/{name}": value for name, value in known.numbers().items()})
+
+
+def object_facts(folder: Path, scene: Scene) -> ObjectFacts:
+    """What is known of the object mesh in an artifact of ``extract_mesh``, with the guide's fallbacks counted."""
+    from rtgs.evaluate.surface import ObjectFacts, hit_shares
+    from rtgs.mesh.container import ObjectGuide, read_object_mesh
+    from rtgs.mesh.score import container_mesh
+    from rtgs.mesh.silhouettes import bounding
+
+    mesh, record = read_object_mesh(folder), json.loads((folder / SUMMARY_FILE).read_text(encoding="utf-8"))
+    guide, truth, distance = ObjectGuide(mesh, cache_views=0), record.get("truth") or {}, None
+    if truth and (container := container_mesh(scene.name)) is not None:
+        distance = truth["distance"] / float(np.linalg.norm(np.ptp(container.vertices, axis=0)))
+    train, test = (
+        hit_shares((guide.surfaces(view.camera), mask) for view in views if (mask := bounding(view.mask)) is not None)
+        for views in (scene.train, scene.test)
+    )
+    return ObjectFacts(
+        source=mesh.source,
+        flat=mesh.flat,
+        silhouette_iou=record.get("silhouette_iou"),
+        distance=distance,
+        front=truth.get("front_within_3_percent"),
+        back=truth.get("back_within_3_percent"),
+        one_hit=train[0],
+        no_hit=train[1],
+        no_hit_test=test[1],
+    )
 
 
 STEP = StepKind(
     "evaluate",
-    4,
+    5,
     evaluate,
     helpers=(
         "rtgs.evaluate.evaluate",
         "rtgs.evaluate.layers",
+        "rtgs.evaluate.surface",
+        "rtgs.mesh.container",
         "rtgs.evaluate.metrics",
         "rtgs.evaluate.lpips",
         "rtgs.evaluate.images",

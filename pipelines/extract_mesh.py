@@ -106,12 +106,16 @@ def _scene_mesh(method: Method, step: int, scene: Scene, params: ExtractMeshPara
 
 def _object_mesh(method: Method, step: int, scene: Scene, params: ExtractMeshParams, context: StepContext) -> None:
     """Of the transparent object: hull, pane, TSDF or a given file."""
+    import numpy as np
+
     from rtgs.mesh.choose import choose_object_mesh
     from rtgs.mesh.container import write_object_mesh
     from rtgs.mesh.silhouettes import mask_set
     from rtgs.mesh.tsdf import fuse_depths, object_fusion
+    from rtgs.prepare.masks_report import MaskReport
 
     made: list[MeshResult] = []
+    drawn = "masks" in context.inputs  # of a scene whose panes somebody drew
     cameras = [view.camera for view in scene.train]
 
     def fuse(box: np.ndarray | None) -> tuple[TriangleMesh, float]:
@@ -123,7 +127,8 @@ def _object_mesh(method: Method, step: int, scene: Scene, params: ExtractMeshPar
         return made[-1].mesh, made[-1].voxel
 
     masks = mask_set(cameras, [view.mask for view in scene.train], _median_depths(method, step, scene))
-    choice = choose_object_mesh(params.source, masks, params.object, fuse)
+    panes = [np.array(pane.corners) for pane in MaskReport.read(context.inputs["masks"]).panes] if drawn else []
+    choice = choose_object_mesh(params.source, masks, params.object, fuse, panes)
     record = _choice_record(choice) | _pictured(choice.mesh.mesh, scene, params, context.out)
     if choice.mesh.source == "tsdf":
         record |= _fusion_record(made[-1])

@@ -22,7 +22,8 @@ from pipelines import (
     train_reflection,
     train_transmittance,
 )
-from pipelines.preparation import SkippedStep, prepare
+from pipelines.mask_plan import draws_panes
+from pipelines.preparation import Preparation, SkippedStep, prepare
 from pipelines.training import StageParams
 from pipelines.transparent import Transparency, find_transparency
 from rtgs.config.schema import Choices, RunConfig
@@ -83,12 +84,13 @@ def build_graph(config: RunConfig, choices: Choices) -> RunGraph:
     prepared = prepare(config)
     scene = prepared.scene
     transparency = find_transparency(config, prepared)
-    training, object_mesh = _training(config, scene, transparency.present)
+    training, object_mesh = _training(config, prepared, transparency.present)
     rendered = render.STEP.step(render.RenderParams(), scene, *training)
     measured = evaluate.STEP.step(
         evaluate.EvaluateParams(config.evaluation, method_label(choices), choices.preset),
         scene,
         *training,
+        *(() if object_mesh is None else (object_mesh,)),
         rendered,
         tools=_pretrained() if config.evaluation.lpips else (),
     )
@@ -115,8 +117,9 @@ def _left_out(config: RunConfig, transparency: Transparency, object_mesh: Step |
     return ()
 
 
-def _training(config: RunConfig, scene: Step, transparent: bool) -> tuple[tuple[Step, ...], Step | None]:
+def _training(config: RunConfig, prepared: Preparation, transparent: bool) -> tuple[tuple[Step, ...], Step | None]:
     """One training step per stage, and the object mesh that a third one builds on."""
+    scene = prepared.scene
     method: MethodSettings = replace(config.method, paper_schedule=ScheduleSettings())  # a preset has read it by now
     steps: list[Step] = []
     object_mesh = None
@@ -124,7 +127,8 @@ def _training(config: RunConfig, scene: Step, transparent: bool) -> tuple[tuple[
         own = stage_settings(method, stage.name)  # so that runs that differ elsewhere share the stage
         params = StageParams(own, config.schedule, config.seed, stage.name, stage.from_step, stage.until)
         if stage.name == "transmittance":
-            object_mesh = extract_mesh.STEP.step(extract_mesh.object_params(config), scene, *steps)
+            read = (*(step for step in prepared.steps if draws_panes(step)), scene, *steps)
+            object_mesh = extract_mesh.STEP.step(extract_mesh.object_params(config), *read)
             steps.append(TRAINING[stage.name].step(params, scene, *steps, object_mesh))
         else:
             steps.append(TRAINING[stage.name].step(params, scene, *steps))

@@ -144,6 +144,11 @@ def mask_step(
     return masks.STEP.step(params, *before, tools=tools)
 
 
+def draws_panes(step: Step) -> bool:
+    """The step makes masks from marks that may be flat panes: the object's mesh takes their planes."""
+    return isinstance(step.params, masks.MaskParams) and step.params.method in ("polygon", "drawn")
+
+
 def _capture_digest(imported: import_scene.ImportParams, scene: SceneSettings) -> str:
     from rtgs.scenes.canonical import capture_digest
 

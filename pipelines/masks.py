@@ -64,7 +64,7 @@ def masks(params: MaskParams, context: StepContext) -> None:
 
 STEP = StepKind(
     "masks",
-    1,
+    2,
     masks,
     helpers=(
         "rtgs.prepare.masks",

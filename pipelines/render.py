@@ -13,6 +13,7 @@ from pipelines.views import read_render, view_maps
 from rtgs.pipeline import StepContext, StepKind
 
 if TYPE_CHECKING:
+    from rtgs.cameras import Camera
     from rtgs.evaluate.evaluate import TimedRender
 
 TIMES_FILE = "render.json"
@@ -66,14 +67,20 @@ def render(params: RenderParams, context: StepContext) -> None:
         context.log.info("rendered %d test views, %.3f s each", len(seconds), sum(seconds.values()) / len(seconds))
 
 
-def read_timed(folder: Path, view_name: str) -> TimedRender:
-    """The image of one rendered view with the time it took."""
+def read_timed(folder: Path, view_name: str, camera: Camera | None = None) -> TimedRender:
+    """One rendered view with the time it took; normals, in the camera's frame, only with its ``camera``."""
+    import torch
+
     from rtgs.evaluate.evaluate import TimedRender
 
     seconds = json.loads((folder / TIMES_FILE).read_text(encoding="utf-8"))["seconds"]
     tensors = read_render(folder, view_name)
     layers = (tensors.get("reflection"), tensors.get("transmission"))
-    return TimedRender(tensors["image"], seconds[view_name], *layers, tensors.get(GIVEN))
+    normal = tensors.get("normal")
+    if normal is not None:
+        normal = None if camera is None else torch.einsum("ij,jhw->ihw", camera.rotation.float(), normal)
+    surface = (tensors.get("depth"), normal)
+    return TimedRender(tensors["image"], seconds[view_name], *layers, tensors.get(GIVEN), *surface)
 
 
 STEP = StepKind(

@@ -56,6 +56,7 @@ def report(params: ReportParams, context: StepContext) -> None:
     decisions += [Decision(**item) for item in summary["decisions"]]  # pyright: ignore[reportGeneralTypeIssues]
     decisions += _mesh_decisions(inputs)
     decisions += _boundary(training)
+    decisions += _guide(table)
     data = ReportData(
         title=params.title,
         evaluation=table,
@@ -134,6 +135,20 @@ def _boundary(training: Path) -> list[Decision]:
     ]
 
 
+def _guide(table: EvaluationTable) -> list[Decision]:
+    """Where the object's mesh gives no pair of surfaces, and how far it is from the true container."""
+    from rtgs.report.page import Decision
+
+    known = table.object
+    if known is None:
+        return []
+    lines = [Decision("rays without two surfaces", known.fallbacks)]
+    if known.distance is not None:
+        why = f"{known.distance:.4f} of its diagonal on average; first surface within 3 % for {known.front:.3f} of the "
+        lines.append(Decision("mesh and true container", f"{why}pixels, second for {known.back:.3f}"))
+    return lines
+
+
 def _mesh_decisions(inputs: Mapping[str, Path]) -> list[Decision]:
     """How the transparent object's mesh was chosen."""
     from rtgs.report.page import Decision
@@ -184,4 +199,4 @@ def _steps(context: StepContext) -> tuple[StepLine, ...]:
     return tuple(lines)
 
 
-STEP = StepKind("report", 4, report, helpers=("rtgs.report.page", "rtgs.report.figures", "rtgs.report.layers"))
+STEP = StepKind("report", 5, report, helpers=("rtgs.report.page", "rtgs.report.figures", "rtgs.report.layers"))

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from rtgs.evaluate.surface import DEPTH_TOLERANCE, NORMAL_TOLERANCE, surface_errors
 from rtgs.mesh.container import ObjectGuide, ObjectMesh
 from rtgs.methods.base import RenderedView, RenderOptions
 from rtgs.train.losses import surface_depth
@@ -17,8 +18,6 @@ if TYPE_CHECKING:
     from rtgs.methods.base import Method
     from rtgs.scenes.scene import Scene, View
 
-DEPTH_TOLERANCE = 0.03  # of the true depth
-NORMAL_TOLERANCE = 15.0  # degrees
 RENDERED_VIEWS = 12  # about so many training views are rendered for their k_s
 
 
@@ -89,13 +88,9 @@ def _against_truth(method: Method, view: View, guide: ObjectGuide, step: int) ->
     buffers = _rendered(method, view, step).buffers
     assert buffers.depth is not None
     assert buffers.normal is not None
-    inside = mask & (truth.depth > 0)
-    true = truth.depth[inside]
-    depth = (surface_depth(buffers.depth, buffers.alpha)[inside] / true - 1).abs()
-    near = (guide.surfaces(view.camera).near[inside] / true - 1).abs()
-    local = torch.einsum("ij,jhw->ihw", view.camera.rotation.float(), buffers.normal)[:, inside]
-    unit = torch.nn.functional.normalize(local, dim=0)
-    angle = torch.rad2deg(torch.acos((unit * truth.normal[:, inside]).sum(0).clamp(-1, 1)))
+    local = torch.einsum("ij,jhw->ihw", view.camera.rotation.float(), buffers.normal)
+    depth, angle = surface_errors(surface_depth(buffers.depth, buffers.alpha), local, truth, mask)
+    near, _ = surface_errors(guide.surfaces(view.camera).near, None, truth, mask)
     return depth, angle, near
 
 

@@ -16,13 +16,14 @@ from rtgs.evaluate.images import ERROR_FULL_SCALE, error_map, error_scale_note, 
 from rtgs.evaluate.layers import LAYER_METRICS, LayerTruth, layer_scales, layer_scores, why_absent
 from rtgs.evaluate.lpips import InputRange, Lpips, lpips
 from rtgs.evaluate.metrics import psnr, quantized, ssim
+from rtgs.evaluate.surface import SURFACE_METRICS, ObjectFacts, surface_scores
 from rtgs.evaluate.weights import MissingWeights, WrongWeights
 
 FORMAT = "rtgs-evaluation"
-VERSION = 3  # 2: the layer metrics; 3: transmission, given masks
+VERSION = 4  # 2: the layer metrics; 3: transmission, given masks; 4: the surface in the mask, the object's mesh
 # Seen through the test views' own masks instead of the mesh's silhouette (methods.md 7; register row 21).
 GIVEN_MASK_METRICS = ("psnr_given_masks", "psnr_masked_given_masks", "ssim_masked_given_masks")
-# In the order of the columns. Higher is better for psnr*, ssim*; lower for lpips*.
+# In the order of the columns. Higher is better for psnr*, ssim*, *_share*; lower for lpips*, *_error*, *_degrees*.
 METRICS = (
     "psnr",
     "ssim",
@@ -34,6 +35,7 @@ METRICS = (
     "lpips_11_masked",
     *LAYER_METRICS,
     *GIVEN_MASK_METRICS,
+    *SURFACE_METRICS,
     "psnr_8bit",
     "ssim_8bit",
     "lpips_01_8bit",
@@ -64,6 +66,8 @@ class TimedRender:
     reflection: Tensor | None = None  # (3, H, W) k_s w_r C_r, of methods that render it
     transmission: Tensor | None = None  # (3, H, W) k_s w_t C_t, likewise
     given_masks: Tensor | None = None  # (3, H, W) the image through the view's own mask, likewise
+    depth: Tensor | None = None  # (H, W) z-depth of the first surface
+    normal: Tensor | None = None  # (3, H, W) of the first surface, camera frame, any length
 
 
 @dataclass(frozen=True)
@@ -109,6 +113,7 @@ class EvaluationTable:
     missing: dict[str, str] = field(default_factory=dict)  # metric -> why it is absent (in all views, or in some)
     reflection_scale: float | None = None  # of psnr_reflection_scaled
     transmission_scale: float | None = None  # of psnr_transmission_scaled
+    object: ObjectFacts | None = None  # of methods with a third stage, on scenes that have one
 
     def mean(self, metric: str) -> float | None:
         """Mean over the views that have the metric; None when none has."""
@@ -156,6 +161,7 @@ def evaluate_views(
     settings: EvaluationSettings = EvaluationSettings(),
     *,
     lpips_model: Lpips | None = None,
+    object_facts: ObjectFacts | None = None,
 ) -> EvaluationTable:
     """Score ``renders[i]`` against ``views[i]``, at the resolution of the photo.
 
@@ -171,7 +177,7 @@ def evaluate_views(
     if len(renders) != len(views):
         raise ValueError(f"{len(renders)} renders for {len(views)} test views of scene {facts.scene!r}")
     if not views:
-        return EvaluationTable(facts, (), dict.fromkeys(METRICS, NO_TEST_VIEWS))
+        return EvaluationTable(facts, (), dict.fromkeys(METRICS, NO_TEST_VIEWS), object=object_facts)
     model, reason = (lpips_model, "") if lpips_model is not None and settings.lpips else load_lpips(settings)
     missing: dict[str, str] = {}
     if model is None:
@@ -187,7 +193,7 @@ def evaluate_views(
     absent = [name for name in LAYER_METRICS if any(row.values[name] is None for row in rows)]
     missing |= {name: why_absent(name, renders, views) for name in absent}
     _explain_absent(rows, settings, missing)
-    return EvaluationTable(facts, tuple(rows), missing, scales["reflection"], scales["transmission"])
+    return EvaluationTable(facts, tuple(rows), missing, scales["reflection"], scales["transmission"], object_facts)
 
 
 def _score(render: TimedRender, view: PhotoView, settings: EvaluationSettings, model: Lpips | None) -> ViewScore:
@@ -205,6 +211,8 @@ def _score(render: TimedRender, view: PhotoView, settings: EvaluationSettings, m
         if model is not None:
             for convention in InputRange:
                 values[f"{convention.value}_masked"] = lpips(model, image, target, convention, mask=mask)
+        if view.truth is not None:
+            values |= surface_scores(render.depth, render.normal, view.truth, mask)
     if settings.masked and render.given_masks is not None:
         values["psnr_given_masks"] = psnr(render.given_masks, target)
         if mask is not None and bool(mask.any()):
@@ -231,6 +239,8 @@ def _explain_absent(rows: Sequence[ViewScore], settings: EvaluationSettings, mis
             missing[name] = "switched off (evaluation.masked=false)"
         elif name in GIVEN_MASK_METRICS:
             missing[name] = "the method has no stage for transparent objects, or the view no mask"
+        elif name in SURFACE_METRICS:
+            missing[name] = "only path-traced captures know the surface in the mask, and the method must render it"
         elif name.endswith("_masked"):
             missing[name] = f"{absent} of {len(rows)} views have no mask, or an empty one"
         else:
@@ -267,6 +277,7 @@ def write_json(path: Path, table: EvaluationTable) -> None:
         "missing": table.missing,
         "reflection_scale": table.reflection_scale,
         "transmission_scale": table.transmission_scale,
+        "object": None if table.object is None else asdict(table.object),
         "views": [asdict(row) for row in table.rows],
     }
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -289,6 +300,7 @@ def read_json(path: Path) -> EvaluationTable:
         document["missing"],
         document["reflection_scale"],
         document["transmission_scale"],
+        None if document["object"] is None else ObjectFacts(**document["object"]),
     )
 
 

@@ -33,6 +33,10 @@ class LayerTruth(Protocol):
     def reflected(self) -> Tensor: ...  # (3, H, W) linear light x exposure
     @property
     def transmitted(self) -> Tensor: ...  # likewise
+    @property
+    def depth(self) -> Tensor: ...  # (H, W) z-depth of the first surface, 0 where nothing
+    @property
+    def normal(self) -> Tensor: ...  # (3, H, W) unit, camera frame
 
 
 class LayeredRender(Protocol):

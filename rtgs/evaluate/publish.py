@@ -58,6 +58,17 @@ COSTS = (
     Metric("peak_memory_mb", "memory MB", 0, None),
     Metric("surfels", "Gaussians", 0, None),
 )
+TRUTH = (  # of path-traced scenes
+    Metric("psnr_reflection", "reflection PSNR", 2, True),
+    Metric("psnr_reflection_scaled", "reflection PSNR, scaled", 2, True),
+    Metric("psnr_transmission", "transmission PSNR", 2, True),
+    Metric("psnr_transmission_scaled", "transmission PSNR, scaled", 2, True),
+    Metric("depth_share_masked", "depth within 3 % in the mask", 3, True),
+    Metric("normal_degrees_masked", "normal error in the mask, degrees", 1, False),
+    Metric("object_distance", "mesh to container, diagonals", 4, False),
+)
+MESH = (Metric("object_silhouette_iou", "IoU of mesh and masks", 3, None),)  # real captures have it too
+ALL = (*QUALITY, *COSTS, *MESH, *TRUTH)
 
 
 @dataclass(frozen=True)
@@ -113,7 +124,7 @@ def build_table(spec: TableSpec, runs: Sequence[Measured]) -> PaperTable:
         if any(other.seed == run.seed for other in group):
             raise ValueError(f"table {spec.name}: {facts.method} on {facts.scene} with seed {run.seed} comes twice")
         group.append(run)
-    values = {key: {m.key: _value(m.key, group) for m in (*QUALITY, *COSTS)} for key, group in groups.items()}
+    values = {key: {m.key: _value(m.key, group) for m in ALL} for key, group in groups.items()}
     ranks = _ranks(values)
     cells = {key: _cell(key, group, values[key], ranks[key], spec) for key, group in groups.items()}
     methods = tuple(dict.fromkeys(method for method, _ in groups))
@@ -132,6 +143,8 @@ def _value(key: str, group: Sequence[Measured]) -> Value | None:
 def _of_run(key: str, evaluation: EvaluationTable) -> float | None:
     if key in ("train_seconds", "peak_memory_mb", "surfels"):
         return getattr(evaluation.facts, key)
+    if key.startswith("object_"):
+        return None if evaluation.object is None else getattr(evaluation.object, key.removeprefix("object_"))
     return evaluation.mean(key)
 
 
@@ -140,7 +153,7 @@ def _ranks(values: Mapping[tuple[str, str], Mapping[str, Value | None]]) -> dict
     ranks: dict[tuple[str, str], dict[str, int]] = {key: {} for key in values}
     for scene in {scene for _, scene in values}:
         mine = [key for key in values if key[1] == scene]
-        for metric in (*QUALITY, *COSTS):
+        for metric in ALL:
             found = {key: round(v.mean, metric.digits) for key in mine if (v := values[key][metric.key]) is not None}
             if metric.higher_is_better is None or len(found) < 2:
                 continue

@@ -12,7 +12,20 @@ import io
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-from rtgs.evaluate.publish import COSTS, PAPER_DATA, QUALITY, STAND_IN, Cell, Metric, PaperTable, TableSpec, Value
+from rtgs.evaluate.publish import (
+    ALL,
+    COSTS,
+    MESH,
+    PAPER_DATA,
+    QUALITY,
+    STAND_IN,
+    TRUTH,
+    Cell,
+    Metric,
+    PaperTable,
+    TableSpec,
+    Value,
+)
 from rtgs.evaluate.tables import NOT_AVAILABLE
 
 
@@ -121,11 +134,11 @@ def _blocks(
     table: PaperTable, marks: Mapping[int, tuple[str, str]], pm: str
 ) -> list[tuple[str, list[str], list[list[str]]]]:
     """(heading, header, rows) of every part of the table."""
-    costs = [m for m in COSTS if any(cell.values[m.key] is not None for cell in table.cells.values())]
-    blocks = [
-        ("", _header(table, QUALITY), _rows(table, QUALITY, marks, pm)),
-        ("Inside the mask, and what it cost", _header(table, costs), _rows(table, costs, marks, pm)),
-    ]
+    blocks = [("", _header(table, QUALITY), _rows(table, QUALITY, marks, pm))]
+    parts = {"Inside the mask, and what it cost": (*COSTS, *MESH), "Against the truth of path-traced scenes": TRUTH}
+    for heading, metrics in parts.items():
+        known = [m for m in metrics if any(cell.values[m.key] is not None for cell in table.cells.values())]
+        blocks += [(heading, _header(table, known), _rows(table, known, marks, pm))] if known else []
     if paper := _paper_rows(table):
         blocks.append(("The paper's figures", _paper_header(table), paper))
     return blocks
@@ -161,16 +174,15 @@ _PAPER_COLUMNS = ("paper_psnr", "paper_ssim", "paper_lpips", "psnr_minus_paper")
 
 def comma_separated(table: PaperTable) -> str:
     """One row per method and scene with everything, unrounded: for other programs."""
-    metrics = (*QUALITY, *COSTS)
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     head = ["table", "data", "scene", "method", "preset", "resolution", "views", "seeds"]
-    head += [f"{m.key}{part}" for m in metrics for part in ("", "_std", "_rank")]
+    head += [f"{m.key}{part}" for m in ALL for part in ("", "_std", "_rank")]
     writer.writerow([*head, *(_PAPER_COLUMNS if table.spec.data == PAPER_DATA else ())])
     for scene in table.scenes:
         for method in table.methods:
             if cell := table.cell(method, scene):
-                writer.writerow(_csv_row(table.spec, cell, metrics))
+                writer.writerow(_csv_row(table.spec, cell, ALL))
     return stream.getvalue()
 
 

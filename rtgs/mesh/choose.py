@@ -12,7 +12,7 @@ import numpy as np
 from rtgs.errors import RtgsError
 from rtgs.mesh.container import ObjectMesh
 from rtgs.mesh.hull import HullResult, carve_hull
-from rtgs.mesh.pane import fit_pane, is_flat
+from rtgs.mesh.pane import drawn_pane, fit_pane, is_flat
 from rtgs.mesh.settings import FLAT, SOURCES, ObjectSettings
 from rtgs.mesh.silhouettes import MaskSet, SilhouetteScore, direction_spread, silhouette_score
 from rtgs.mesh.triangles import TriangleMesh, read_mesh_obj, read_mesh_ply
@@ -36,8 +36,10 @@ class Choice:
 class _Candidates:
     """Makes the meshes one by one, and scores them alike."""
 
-    def __init__(self, masks: MaskSet, settings: ObjectSettings, fuse: Fusion) -> None:
-        self.masks, self.settings, self.fuse = masks, settings, fuse
+    def __init__(
+        self, masks: MaskSet, settings: ObjectSettings, fuse: Fusion, panes: Sequence[np.ndarray] = ()
+    ) -> None:
+        self.masks, self.settings, self.fuse, self.panes = masks, settings, fuse, panes
         self.decisions: list[tuple[str, str]] = []
         self.hull: HullResult | None = None
         self.scores: dict[str, float] = {}
@@ -53,6 +55,20 @@ class _Candidates:
         if hull.note:
             self.decisions.append(("hull not trimmed", hull.note))
         return ObjectMesh(hull.mesh, "hull", hull.voxel, flat=False)
+
+    def drawn(self) -> ObjectMesh | None:
+        """The panes that somebody drew, where they explain the masks."""
+        if not self.panes:
+            return None
+        pane = drawn_pane(self.panes, self.masks.views)
+        self.scores["drawn panes"] = score = self.score(pane.mesh).mean
+        if score >= self.settings.pane.agree:
+            return ObjectMesh(pane.mesh, "given", pane.voxel, flat=True)
+        why = (
+            f"their silhouette IoU with the masks is {score:.3f} (mesh.object.pane.agree {self.settings.pane.agree:g})"
+        )
+        self.decisions.append(("drawn panes not taken", why))
+        return None
 
     def pane(self) -> ObjectMesh:
         """The plane on which the masks agree."""
@@ -84,7 +100,9 @@ class _Candidates:
         return is_flat(mesh) if self.settings.flat == "auto" else self.settings.flat == "yes"
 
 
-def choose_object_mesh(source: str, masks: MaskSet, settings: ObjectSettings, fuse: Fusion) -> Choice:
+def choose_object_mesh(
+    source: str, masks: MaskSet, settings: ObjectSettings, fuse: Fusion, panes: Sequence[np.ndarray] = ()
+) -> Choice:
     """The mesh of the transparent object.
 
     Args:
@@ -93,6 +111,8 @@ def choose_object_mesh(source: str, masks: MaskSet, settings: ObjectSettings, fu
         masks: of the training views, with the base set's depth.
         settings: what else can be chosen.
         fuse: makes the TSDF mesh when it is needed.
+        panes: flat polygons (K, 3) that the masks were drawn as, in the world; taken instead of a plane that is looked
+            for where they explain the masks.
 
     Raises:
         RtgsError: an unknown name, or no mesh can be made; with what was tried.
@@ -102,7 +122,7 @@ def choose_object_mesh(source: str, masks: MaskSet, settings: ObjectSettings, fu
             f"mesh.source is {source!r} (one of {', '.join(SOURCES)}), mesh.object.flat is {settings.flat!r} (one of "
             f"{', '.join(FLAT)})"
         )
-    tried = _Candidates(masks, settings, fuse)
+    tried = _Candidates(masks, settings, fuse, panes)
     mesh = {"hull": _hull_or_pane, "auto": _automatic}.get(source, lambda found: getattr(found, _MADE[source])())(tried)
     about = f"{len(masks.views)} masks, {masks.cut} cut by the image border"
     left = [f"{masks.without} views have no mask", f"{masks.empty} masks are empty", f"{masks.full} cover everything"]
@@ -120,6 +140,8 @@ _MADE = {"tsdf": "fused", "given": "given"}
 def _hull_or_pane(tried: _Candidates) -> ObjectMesh:
     """A pane where the masks are those of a pane, else the hull."""
     flat, masks, pane = tried.settings.flat, tried.masks, tried.settings.pane
+    if flat != "no" and (drawn := tried.drawn()) is not None:
+        return drawn
     if flat == "yes":
         return tried.pane()
     spread = direction_spread(masks.views)

@@ -1,7 +1,8 @@
 """A pane of glass from its masks: the plane on which the masks of all views agree.
 
 A hull needs views from the side; a clock's door or a window is seen from the front only. But masks of something flat,
-carried back onto its plane, are all the same shape.
+carried back onto its plane, are all the same shape. Where somebody drew the panes, their plane is known: masks of a
+glass front that fills the pictures say nothing about it.
 """
 
 from __future__ import annotations
@@ -82,6 +83,65 @@ def fit_pane(views: Sequence[MaskView]) -> Pane:
     if best > _HOPELESS:
         best, plane = max((_improved(some, plane) for _, plane in starts[:_STARTS]), key=lambda item: item[0])
     return Pane(*_mesh(outlines, plane), best)
+
+
+def drawn_pane(polygons: Sequence[np.ndarray], views: Sequence[MaskView]) -> Pane:
+    """The pane that somebody drew: flat polygons (K, 3) in the world, as far as a view has them in the picture.
+
+    ``agreement`` is 1: nothing is looked for.
+
+    Raises:
+        RtgsError: no view sees any of it.
+    """
+    step = max(float(np.ptp(corners, axis=0).max()) for corners in polygons) / (_MESH - 1)
+    centers = np.stack([view.camera.center.numpy() for view in views])
+    vertices, faces, count = [], [], 0
+    for corners in polygons:
+        places, triangles, plane = _cut_out(corners.astype(np.float64), step)
+        toward = (centers - plane.center).mean(0) @ plane.axes[2]
+        points = plane.center + (places[:, :, None] * plane.axes[:2]).sum(1)
+        seen = _in_a_picture(points, views)[triangles].any(1) | _in_a_picture(points[triangles].mean(1), views)
+        triangles = triangles[seen]
+        first, second, third = (places[triangles[:, k]] for k in range(3))
+        area = np.linalg.det(np.stack([second - first, third - first], axis=1))
+        faces.append(count + np.where((area * toward > 0)[:, None], triangles, triangles[:, ::-1]))
+        vertices.append(points)
+        count += len(points)
+    every, used = np.concatenate(faces), np.concatenate(vertices)
+    if len(every) == 0:
+        raise RtgsError("no view has any of the drawn panes in its picture: do the marks belong to these photos?")
+    kept, renumbered = np.unique(every, return_inverse=True)
+    return Pane(TriangleMesh(used[kept].astype(np.float32), renumbered.reshape(-1, 3)), step, 1.0)
+
+
+def _cut_out(corners: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray, _Plane]:
+    """A polygon (K, 3) as (P, 2) places on its plane about its middle, and (F, 3) triangles of them."""
+    from scipy.spatial import Delaunay
+    from skimage.measure import points_in_poly
+
+    center = corners.mean(0)
+    plane = _plane(center, np.linalg.svd(corners - center)[2][2], 0.0)
+    outline = (corners - center) @ plane.axes[:2].T
+    rim = []
+    for start, end in zip(outline, np.roll(outline, -1, axis=0), strict=True):
+        count = max(2, int(np.linalg.norm(end - start) / (2 * step)))
+        rim.append(start + (end - start) * np.linspace(0, 1, count, endpoint=False)[:, None])
+    low, high = outline.min(0), outline.max(0)
+    grid = np.stack(np.meshgrid(*(np.arange(a, b, 4 * step) for a, b in zip(low, high, strict=True))), axis=-1)
+    inner = grid.reshape(-1, 2)
+    places = np.unique(np.concatenate([*rim, inner[points_in_poly(inner, outline)]]).round(9), axis=0)
+    triangles = Delaunay(places).simplices
+    return places, triangles[points_in_poly(places[triangles].mean(1), outline)], plane
+
+
+def _in_a_picture(points: np.ndarray, views: Sequence[MaskView]) -> np.ndarray:
+    """(N,) bool: at least one view has the point in its picture."""
+    seen = torch.zeros(len(points), dtype=torch.bool)
+    for view in views:
+        pixels, depth = view.camera.project(torch.from_numpy(points))
+        inside = (pixels >= 0).all(1) & (pixels[:, 0] <= view.camera.width) & (pixels[:, 1] <= view.camera.height)
+        seen |= (depth > 0) & inside
+    return seen.numpy()
 
 
 def _half_size(views: Sequence[MaskView]) -> float:

@@ -214,16 +214,20 @@ class ReflectiveMethod(SurfelMethod):
         return RenderedView(camera, image, buffers, layers, specular, passed.first_bounce, seen_through)
 
     def _weights(self, rays: MirrorRays, pixels: SurfacePixels, glass: Tensor | None) -> tuple[Tensor, Tensor]:
-        """w_r and w_t of the traced pixels; ``glass`` (P,) bool: they show a transparent object, None: none does."""
+        """w_r and w_t (0 outside the glass) of the traced pixels; ``glass`` (P,) bool: they show a transparent object,
+        None: none does."""
         optics, gain = self.settings.optics, self.settings.transmittance.max_gain
         reflection = reflected_weight(rays.cosine, pixels, optics)
         if glass is None:
             return reflection, torch.zeros(())
-        inside = pixel_weights(rays.cosine, pixels, optics if gain is None else replace(optics, max_gain=gain))
+        rows = glass.nonzero()[:, 0]
+        shown = replace(pixels, roughness=pixels.roughness[rows], f0=pixels.f0.index_select(-1, rows))
+        inside = pixel_weights(rays.cosine[rows], shown, optics if gain is None else replace(optics, max_gain=gain))
         transmittance = self.settings.transmittance
         bounded = transmittance.max_weight > 0 and transmittance.interface.count > 0
         own = inside.reflection.clamp_max(transmittance.max_weight) if bounded else inside.reflection
-        return torch.where(glass, own, reflection), inside.transmission
+        passed = torch.zeros_like(reflection).index_copy(-1, rows, inside.transmission)
+        return reflection.index_copy(-1, rows, own), passed
 
     def _flat_pixels(self, buffers: RasterBuffers) -> SurfacePixels:
         """Every pixel of the view, flattened."""

@@ -72,7 +72,7 @@ def make_masks(request: MaskRequest, out: Path, say: Say) -> MaskReport:
         common, checked = _common(maker, list(small.values()), request.settings.clean)
     if common is not None:
         rows = [_cleaned(row, common, small.get(row.name), request, out) for row in rows]
-    report = MaskReport(request.method, maker.networks, tuple(rows), checked, cached, maker.notes)
+    report = MaskReport(request.method, maker.networks, tuple(rows), checked, cached, maker.notes, maker.panes)
     _finish(report, out, {view.name: view for view in views}, request.scene, common.hull if common else None, small)
     say(str(report))
     return report

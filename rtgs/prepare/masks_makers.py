@@ -21,6 +21,7 @@ from rtgs.prepare.masks_given import given_files, read_given
 from rtgs.prepare.masks_grabcut import Marks, grab_cut
 from rtgs.prepare.masks_hull import Hull, SmallMask, carve, small_mask
 from rtgs.prepare.masks_plane import Pane, fit_pane, in_polygon, seen_from
+from rtgs.prepare.masks_report import DrawnPane
 from rtgs.prepare.masks_segment import Segmenter
 from rtgs.prepare.masks_settings import MaskSettings
 from rtgs.prepare.onnx import Network
@@ -54,6 +55,8 @@ class Maker(Protocol):
     """What is masked has a volume that a visual hull can be carved of."""
     networks: tuple[str, ...]
     notes: tuple[str, ...]
+    panes: tuple[DrawnPane, ...]
+    """Flat glass that was drawn."""
 
     def order(self, views: Sequence[CaptureView]) -> list[CaptureView]:
         """The photos in the order they are to be done."""
@@ -95,6 +98,7 @@ class _PlainMaker:
     solid: bool = True
     networks: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    panes: tuple[DrawnPane, ...] = ()
 
     def order(self, views: Sequence[CaptureView]) -> list[CaptureView]:
         """As they are."""
@@ -297,6 +301,10 @@ class DrawnMaker(_PlainMaker):
             for name, corners in panes.items()
         ]
         self.solid = not self._panes
+        self.panes = tuple(
+            DrawnPane(pane.name, tuple((float(x), float(y), float(z)) for x, y, z in pane.corners))
+            for pane in self._panes
+        )
         self.notes = tuple(_words(pane, self._settings.max_error) for pane in self._panes)
         self._marked: list[SmallMask] = []
         self._hull: Hull | None = None

@@ -49,6 +49,14 @@ class MaskRow:
 
 
 @dataclass(frozen=True)
+class DrawnPane:
+    """Flat glass that somebody drew."""
+
+    name: str
+    corners: tuple[tuple[float, float, float], ...]  # world frame of the capture, on one plane
+
+
+@dataclass(frozen=True)
 class MaskReport:
     """All photos of a capture. Written as ``masks.json`` and ``masks.csv``."""
 
@@ -58,6 +66,7 @@ class MaskReport:
     checked: str  # how the masks were compared, or why not
     from_cache: int = 0
     notes: tuple[str, ...] = ()
+    panes: tuple[DrawnPane, ...] = ()
 
     @property
     def masks(self) -> int:

@@ -11,7 +11,19 @@ import pytest
 import torch
 
 from benchmarks import glass_ladder
-from benchmarks.glass_ladder import BRIGHT, RUNGS, base_config, bright_pixels, prepare
+from benchmarks.glass_ladder import (
+    BRIGHT,
+    CHOICES,
+    LADDER,
+    RUNGS,
+    base_config,
+    bright_pixels,
+    named,
+    prepare,
+    sized,
+)
+from pipelines.graph import build_graph
+from rtgs.config import compose
 
 TINY = (
     *("scene.long_side=48", "schedule.total=12", "schedule.checkpoint_every=12", "method.density.max_surfels=800"),
@@ -20,7 +32,7 @@ TINY = (
 
 
 def options(tmp_path: Path) -> SimpleNamespace:
-    return SimpleNamespace(preset="smoke", set=list(TINY), root=tmp_path)
+    return SimpleNamespace(preset="smoke", size="preset", set=list(TINY), root=tmp_path)
 
 
 def test_every_rung_is_another_recipe_of_the_same_scene(tmp_path: Path):
@@ -39,10 +51,33 @@ def test_every_rung_is_another_recipe_of_the_same_scene(tmp_path: Path):
         prepare("matte_room", options(tmp_path))  # type: ignore[arg-type]
 
 
+def test_rungs_share_the_stages_that_do_not_differ(tmp_path: Path):
+    arguments = SimpleNamespace(preset="quick", size="small", set=[], root=tmp_path)
+    setting = prepare("ball_statue", arguments)  # type: ignore[arg-type]
+    config = base_config("ball_statue", arguments)  # type: ignore[arg-type]
+    assert (config.schedule.total, config.scene.long_side) == (1000, 128)
+    keys: dict[str, dict[str, str]] = {}
+    for name in ("truth", "hull", "tsdf", "paper", "before", "normal_loss_1", "paper_mono_in_mask", "two_stages"):
+        words = ["scene=ball_statue", "method=rtgs", "preset=quick", *sized(arguments)]  # type: ignore[arg-type]
+        words += [f"scene.split_file={setting.split}", *RUNGS[name].words(setting, config)]
+        keys[name] = {step.name: step.fingerprint for step in build_graph(*compose(words)).training}
+    first, second = ({key[step] for key in keys.values()} for step in ("train_diffuse", "train_reflection"))
+    assert len(first) == 2, "L_mono of another weight is another first stage"
+    assert len(second) == 3, "and without a third stage the second goes on to the end"
+    assert len({key["train_transmittance"] for name, key in keys.items() if name != "two_stages"}) == 7
+
+
+def test_groups_are_rungs_named_once():
+    assert named(["ladder", "choices"]) == [*LADDER, *CHOICES]
+    assert named(["hull", "choices", "hull"])[0] == "hull"
+    assert len(named(["choices"])) == len(CHOICES) + 2
+
+
 def test_a_rung_goes_through_the_pipeline(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    words = ["--scenes", "ball_statue", "--rungs", "truth", "--preset", "smoke", "--root", str(tmp_path)]
+    words = ["--scenes", "ball_statue", "--rungs", "truth", "--preset", "smoke", "--size", "preset"]
+    words += ["--root", str(tmp_path)]
     monkeypatch.setattr(sys, "argv", ["glass_ladder", *words, "--set", *TINY])
     glass_ladder.main()
     found = json.loads(capsys.readouterr().out.splitlines()[-1])
@@ -53,7 +88,9 @@ def test_a_rung_goes_through_the_pipeline(
     assert all(figures[name] > 3 for name in ("psnr", "psnr_masked", "psnr_bright", "psnr_held_out"))
     assert figures["seconds"] > 0
     text = (tmp_path / "ladder-smoke.md").read_text()
-    assert text.startswith("`python -m benchmarks.glass_ladder --preset smoke --scenes ball_statue --rungs truth")
+    assert text.startswith(
+        "`python -m benchmarks.glass_ladder --preset smoke --size preset --scenes ball_statue --rungs truth"
+    )
     assert "| ball_statue | true mesh, true normals held fixed |" in text
 
 

@@ -22,6 +22,8 @@ class Truth:
     specular: Tensor
     reflected: Tensor
     transmitted: Tensor
+    depth: Tensor
+    normal: Tensor
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,8 @@ def photo(seed: int, share: float = 0.5) -> Photo:
     specular = torch.zeros(10, 12, dtype=torch.bool)
     specular[: round(10 * share)] = True
     light = (random(3, 10, 12, seed=seed + 50), random(3, 10, 12, seed=seed + 90))
-    return Photo(f"{seed}.png", random(3, 10, 12, seed=seed), Truth(specular, *light))
+    surface = (torch.ones(10, 12), torch.zeros(3, 10, 12))
+    return Photo(f"{seed}.png", random(3, 10, 12, seed=seed), Truth(specular, *light, *surface))
 
 
 def test_encoding_is_the_srgb_curve():

@@ -10,7 +10,7 @@ import torch
 from rtgs.errors import RtgsError
 from rtgs.mesh.choose import Choice, choose_object_mesh, read_given
 from rtgs.mesh.hull import HullSettings
-from rtgs.mesh.pane import fit_pane, is_flat
+from rtgs.mesh.pane import drawn_pane, fit_pane, is_flat
 from rtgs.mesh.settings import ObjectSettings
 from rtgs.mesh.silhouettes import MaskSet, mask_set
 from rtgs.mesh.triangles import TriangleMesh, read_mesh_obj, write_mesh_obj, write_mesh_ply
@@ -106,6 +106,44 @@ def test_a_pane_can_be_asked_for_and_bodies_are_none() -> None:
     assert is_flat(pane(1.0, 0.7))
     assert is_flat(box((0, 0, 0), (1, 1, 0.02)))
     assert not is_flat(box((0, 0, 0), (1, 1, 0.2)))
+
+
+def glass_front() -> tuple[list, list[np.ndarray], TriangleMesh]:
+    """A walk along three panes with bars between them that go on beyond every picture, and the wall that they are."""
+    places = np.linspace(-2.5, 2.5, 12)
+    cameras = [
+        replace(camera_at((x, -1.2, 0.0), (x + 0.4, 0, 0), width=96, height=60, focal=100), name=f"{k:02d}")
+        for k, x in enumerate(places)
+    ]
+    sides = [(-6.0, -1.6), (-1.5, 0.9), (1.0, 6.0)]
+    panes = [np.array([(a, 0, -3), (b, 0, -3), (b, 0, 3), (a, 0, 3)], float) for a, b in sides]
+    corners = np.concatenate(panes).astype(np.float32)
+    faces = np.array([[4 * k + c for c in face] for k in range(3) for face in ((0, 1, 2), (0, 2, 3))])
+    return cameras, panes, TriangleMesh(corners, faces)
+
+
+def test_drawn_panes_are_taken_where_masks_cannot_tell() -> None:
+    """Masks of a glass front that fills the pictures say nothing about its plane; what was drawn does."""
+    cameras, panes, wall = glass_front()
+    masks = masks_of(wall, cameras)
+    assert all(view.cut for view in masks.views)
+    choice = choose_object_mesh("auto", masks, SETTINGS, no_fusion, panes)
+    assert choice.mesh.flat
+    assert choice.mesh.source == "given"
+    assert choice.iou.mean > 0.98
+    assert set(choice.candidates) == {"drawn panes"}, "nothing else is tried"
+    vertices = choice.mesh.mesh.vertices
+    assert np.abs(vertices[:, 1]).max() < 1e-6
+    assert np.ptp(vertices[:, 0]) < 11, "what no picture shows is left out"
+    assert np.abs(vertices[:, 2]).max() < 2.5
+    assert (choice.mesh.mesh.face_normals()[:, 1] < 0).all()  # towards the cameras
+    moved = [corners + np.array([0, 1.5, 0]) for corners in panes]
+    body = masks_of(sphere(0.8, 24), ring(24))
+    other = choose_object_mesh("auto", body, SETTINGS, no_fusion, moved)
+    assert other.mesh.source == "hull"
+    assert any(what == "drawn panes not taken" for what, _ in other.decisions)
+    with pytest.raises(RtgsError, match="no view has any of the drawn panes"):
+        drawn_pane([corners - np.array([0, 50, 0]) for corners in panes], masks.views)
 
 
 def test_given_meshes(tmp_path: Path) -> None:

@@ -102,6 +102,16 @@ def test_only_scenes_with_masks_that_show_something_get_the_third_stage(glass: P
     assert not any(step.name == "train_transmittance" for step in graph_of(glass, "method=2dgs").skipped)
 
 
+def test_the_mesh_takes_the_planes_that_somebody_drew(tmp_path: Path):
+    capture = write_capture(tmp_path / "window", "none")
+    corners = [[8, 6], [24, 6], [24, 18], [8, 18]]
+    drawn = {"panes": {"window": {"000.png": corners, "002.png": corners}}}
+    (capture / "masks.yaml").write_text(json.dumps(drawn))
+    mesh = graph_of(capture, "scene.masks_dir=masks").mesh
+    assert mesh is not None
+    assert [step.name for step in mesh.upstream] == ["masks", "import_scene", "train_diffuse", "train_reflection"]
+
+
 def test_the_rows_of_table_3_share_everything_before_the_third_stage(glass: Path):
     swept = (conf_dir() / "experiment" / "table3.yaml").read_text()
     assert ",".join(ROWS) in swept
@@ -151,6 +161,10 @@ def test_table_3_runs_each_shared_step_once_and_nothing_twice(root: Path, glass:
     table = json.loads((root / "runs" / "glass_ball-rtgs-smoke" / "metrics.json").read_text())
     assert table["mean"]["psnr_masked"] is not None
     assert table["mean"]["psnr_masked_given_masks"] is not None
+    assert table["object"]["silhouette_iou"] > 0.5
+    assert 0 <= table["object"]["no_hit"] < 0.5, "the guide's fallbacks are counted"
+    assert "rays without two surfaces" in page
+    assert "meet one surface only" in page
 
 
 def _artifacts_are_complete(store: Path, third: list[Path]) -> None:

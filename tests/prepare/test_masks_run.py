@@ -208,6 +208,9 @@ def test_a_pane_is_carried_into_the_scene(tmp_path):
     assert "flat panes have none" in report.checked
     assert "classical fallback" in said[-1]
     assert report.notes[0].startswith("pane window: corners drawn in 2 photos, 75 degrees apart")
+    (pane,) = MaskReport.read(out).panes
+    assert pane.name == "window"
+    np.testing.assert_allclose(pane.corners, PANE, atol=0.02)
     settings = SceneSettings(path=str(root), masks_dir=str((out / "masks").absolute()))
     scene = load_scene(settings)
     for view in (*scene.train, *scene.test):

@@ -1,0 +1,103 @@
+"""How well the surface of a transparent object is known: of a render, pixel by pixel against the truth of path-traced
+captures, and of the object's mesh, against its masks and its true container."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+DEPTH_TOLERANCE = 0.03  # of the true depth
+NORMAL_TOLERANCE = 15.0  # degrees
+SURFACE_METRICS = ("depth_error_masked", "depth_share_masked", "normal_degrees_masked", "normal_share_masked")
+
+
+class SurfaceTruth(Protocol):
+    """What the figures need of a view's truth; :class:`rtgs.scenes.truth.ViewTruth` has it."""
+
+    @property
+    def depth(self) -> Tensor: ...  # (H, W) z-depth of the first surface, 0 where nothing
+    @property
+    def normal(self) -> Tensor: ...  # (3, H, W) unit, camera frame
+
+
+class MeshSurfaces(Protocol):
+    """Where the pixels of a camera meet the object; :class:`rtgs.mesh.container.ObjectSurfaces` has it."""
+
+    @property
+    def hit(self) -> Tensor: ...  # (H, W) bool
+    @property
+    def second(self) -> Tensor: ...  # (H, W) bool
+
+
+@dataclass(frozen=True)
+class ObjectFacts:
+    """The mesh of the transparent object; None: not known. Shares are of the pixels in the masks that bound something.
+
+    The fallbacks of methods.md 6.3: where the mesh has one surface, the object is a thin sheet, seen through without a
+    depth between its walls; where the ray misses it, a training pixel likewise, and a test pixel shows no transmission.
+    """
+
+    source: str  # "hull", "tsdf", "given"
+    flat: bool  # a pane: one surface everywhere
+    silhouette_iou: float | None  # with the masks of the training views, where nothing opaque hides the object
+    distance: float | None  # of mesh and true container to each other, mean, in diagonals of the container
+    front: float | None  # share of first surfaces within 3 % of the true one, over the test views
+    back: float | None  # of second ones
+    one_hit: float | None  # share whose ray meets one surface only, over the training views
+    no_hit: float | None  # share whose ray misses the mesh, likewise
+    no_hit_test: float | None  # over the test views
+
+    def numbers(self) -> dict[str, float]:
+        """What is known, by name."""
+        return {name: value for name, value in vars(self).items() if isinstance(value, float)}
+
+    @property
+    def fallbacks(self) -> str:
+        """One line on rays without a pair of surfaces."""
+        if self.one_hit is None or self.no_hit is None:
+            return "no masks"
+        text = f"of the masked training pixels {self.one_hit:.2%} meet one surface only, {self.no_hit:.2%} miss the "
+        text += "mesh: a thin sheet there"
+        if self.no_hit_test is not None:
+            text += f"; of the test views' masks {self.no_hit_test:.2%} miss it: nothing is transmitted there"
+        return f"{text}; a pane has one surface by nature" if self.flat else text
+
+
+def surface_errors(depth: Tensor, normal: Tensor | None, truth: SurfaceTruth, mask: Tensor) -> tuple[Tensor, Tensor]:
+    """Of the P pixels in ``mask`` (H, W) bool where something is: (P,) relative error of ``depth`` (H, W), and (P,)
+    degrees between ``normal`` (3, H, W), camera frame, any length, and the true one; (0,) without a normal."""
+    inside = mask & (truth.depth > 0)
+    error = (depth[inside] / truth.depth[inside] - 1).abs()
+    if normal is None:
+        return error, torch.zeros(0)
+    unit = torch.nn.functional.normalize(normal[:, inside], dim=0)
+    return error, torch.rad2deg(torch.acos((unit * truth.normal[:, inside]).sum(0).clamp(-1, 1)))
+
+
+def surface_scores(depth: Tensor | None, normal: Tensor | None, truth: SurfaceTruth, mask: Tensor) -> dict[str, float]:
+    """Those of SURFACE_METRICS that can be had: medians of the errors, shares within 3 % and 15 degrees."""
+    if depth is None:
+        return {}
+    error, angle = surface_errors(depth, normal, truth, mask)
+    names = iter(SURFACE_METRICS)
+    found = {}
+    for values, tolerance in ((error, DEPTH_TOLERANCE), (angle, NORMAL_TOLERANCE)):
+        median, share = next(names), next(names)
+        if len(values):
+            found |= {median: float(values.median()), share: float((values < tolerance).double().mean())}
+    return found
+
+
+def hit_shares(seen: Iterable[tuple[MeshSurfaces, Tensor]]) -> tuple[float | None, float | None]:
+    """Shares of the masked pixels whose ray meets one surface only, and none; from surfaces and masks (H, W) bool of
+    views. None: nothing is masked."""
+    one = none = count = 0
+    for surfaces, mask in seen:
+        one += int((mask & surfaces.hit & ~surfaces.second).sum())
+        none += int((mask & ~surfaces.hit).sum())
+        count += int(mask.sum())
+    return (one / count, none / count) if count else (None, None)
