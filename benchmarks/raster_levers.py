@@ -50,12 +50,14 @@ class RasterScene:
 
     def render(self, options: RasterOptions, stride: int = 1) -> Answer:
         """Features (12, H / stride, W / stride) and the gradient of the means."""
-        leaves = [tensor.clone().requires_grad_() for tensor in self.inputs]
+        means, tangent_u, tangent_v, *others = (tensor.clone().requires_grad_() for tensor in self.inputs)
+        scales, opacities, colors = others
         camera = self.camera.resized(self.camera.width // stride, self.camera.height // stride)
-        features = rasterize_surfels(*leaves, camera, options=options).features
+        surfels = (means, tangent_u, tangent_v, scales, opacities)
+        features = rasterize_surfels(*surfels, features=colors, camera=camera, options=options).features
         features.backward(avg_pool2d(self.upstream, stride) * stride**2)
-        assert leaves[0].grad is not None
-        return features.detach(), leaves[0].grad
+        assert means.grad is not None
+        return features.detach(), means.grad
 
 
 def raster_scene(count: int) -> RasterScene:

@@ -10,6 +10,10 @@ A Markdown table, then a JSON object as the last line.
 
 from __future__ import annotations
 
+import os
+
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # a waiting thread must not count as working; before torch loads
+
 import argparse
 import json
 import time

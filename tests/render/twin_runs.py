@@ -65,7 +65,7 @@ def run(
 def answer(scene: SurfelScene, seed: int = 0, options: RasterOptions = ALL_OUTPUTS) -> Expected:
     """The twin's pictures and gradients for random upstream gradients, zero on flagged pixels."""
     exact = tuple(tensor.double() for tensor in scene.surfels.all())
-    flagged = discontinuity_mask(*exact, scene.camera, options=options)
+    flagged = discontinuity_mask(*exact, scene.camera, options=options)  # type: ignore[misc]
     generator = torch.Generator().manual_seed(seed)
     shapes = dict.fromkeys(OUTPUTS, ()) | {"features": (scene.surfels.features.shape[1],), "normal": (3,)}
     upstream = {name: torch.randn(*shapes[name], *flagged.shape, generator=generator) * ~flagged for name in OUTPUTS}
