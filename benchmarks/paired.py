@@ -141,10 +141,11 @@ def summary(found: Sequence[Verdict], against: str) -> list[str]:
     lines = []
     for method in dict.fromkeys(verdict.method for verdict in found):
         own = [verdict for verdict in found if verdict.method == method]
-        judged = [one for one in own if one.gain is not None]
+        judged = [one for one in own if one.beats is not None]
         wins, losses = sum(bool(one.beats) for one in judged), [one.scene for one in own if one.not_worse is False]
+        won = f"beats {against} on {wins} of {len(judged)} scenes" if judged else "its gain cannot be judged, no spread"
         worse = f"worse than {WORSE} dB overall on {', '.join(losses)}" if losses else f"nowhere worse than {WORSE} dB"
-        lines.append(f"{method}: beats {against} on {wins} of {len(judged)} scenes; {worse}")
+        lines.append(f"{method}: {won}; {worse}")
     return lines
 
 

@@ -57,7 +57,7 @@ def test_verdicts_follow_the_spread_and_borrow_it():
     assert "spread unknown" in alone.sentence("2dgs", "on specular objects")
     first, second = summary([toycar, spheres, sedan, alone], "2dgs")
     assert first == "rtgs: beats 2dgs on 1 of 3 scenes; worse than 0.1 dB overall on sedan"
-    assert second == "envgs: beats 2dgs on 0 of 1 scenes; nowhere worse than 0.1 dB"
+    assert second == "envgs: its gain cannot be judged, no spread; nowhere worse than 0.1 dB"
 
 
 def test_unequal_runs_are_not_paired():
