@@ -1,14 +1,16 @@
 """The tracer's levers end to end: PSNR of method ``rtgs`` after equal time, for ``benchmarks.speed_error``.
 
-Each setting is trained twice: for as many steps as the reference (equal steps), and for as many as fit into its CPU
-seconds (equal time, predicted from the first run; the seconds it took are reported). Preset ``quick``, its schedule
-shrunk along; a matte verdict is switched off, because it would end what is to be measured. One run per point.
+Each setting is trained for as many steps as the reference (equal steps), and for as many as fit into its CPU seconds
+(equal time, predicted from the first run, and once more where that was off; the seconds it took are reported). Preset
+``quick``, its schedule shrunk along; a matte verdict is switched off, because it would end what is to be measured. One
+run per point.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import log
 from typing import TYPE_CHECKING
 
 from torch.nn.functional import avg_pool2d, normalize
@@ -38,6 +40,7 @@ SETTINGS: dict[str, tuple[str, ...]] = {  # the first is the reference: every pi
     "half the resolution": (f"{TRACED}.threshold=0",),  # of the training views, for rasteriser and tracer alike
 }
 HALVED = "half the resolution"
+CLOSE_ENOUGH = 0.1  # of the reference's seconds
 NOT_MATTE = "method.reflection.matte.probation=0"
 
 
@@ -62,11 +65,26 @@ def end_to_end_points(
         point = _train(scene, name, "steps", steps, long_side)
         points.append(point)
         print(point, flush=True)
-        afforded = round(steps * points[0].cpu_seconds / point.cpu_seconds)
         if name != settings[0]:
-            points.append(_train(scene, name, "time", max(2, afforded), long_side))
+            points.append(_train_as_long(scene, point, points[0].cpu_seconds, long_side))
             print(points[-1], flush=True)
     return points
+
+
+def _train_as_long(scene: Sequence[str], known: EndToEndPoint, seconds: float, long_side: int | None) -> EndToEndPoint:
+    """The setting of ``known``, trained for about ``seconds``: later steps are dearer, the first guess may be off."""
+    steps = max(2, round(known.steps * seconds / known.cpu_seconds))
+    found = _train(scene, known.setting, "time", steps, long_side)
+    if steps == known.steps or abs(found.cpu_seconds / seconds - 1) < CLOSE_ENOUGH:
+        return found
+    return _train(scene, known.setting, "time", afforded_steps(known, found, seconds), long_side)
+
+
+def afforded_steps(first: EndToEndPoint, second: EndToEndPoint, seconds: float) -> int:
+    """Steps that take ``seconds`` if the time is a power of the number of steps, as two runs tell it."""
+    growth = log(second.cpu_seconds / first.cpu_seconds) / log(second.steps / first.steps)
+    growth = max(growth, 0.5)  # of two runs that a busy machine has disturbed
+    return max(2, round(first.steps * (seconds / first.cpu_seconds) ** (1 / growth)))
 
 
 def _train(scene: Sequence[str], name: str, equal: str, steps: int, long_side: int | None) -> EndToEndPoint:

@@ -139,6 +139,13 @@ def test_speed_error_end_to_end(run, tmp_path: Path) -> None:
     assert all(point["psnr"] > 0 and point["cpu_seconds"] > 0 for point in points)
 
 
+def test_equal_time_is_found_from_two_runs() -> None:
+    def point(steps: int) -> trace_training.EndToEndPoint:
+        return trace_training.EndToEndPoint("a", "steps", steps, 1e-4 * steps**1.5, None, None)
+
+    assert trace_training.afforded_steps(point(600), point(1275), point(900).cpu_seconds) == 900
+
+
 def test_half_the_resolution_is_of_the_training_views_alone() -> None:
     made = mirror_scene(8, 25, 18, points=20, test_every=8).scene
     half = trace_training.half_resolution(made)
