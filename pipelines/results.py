@@ -211,6 +211,8 @@ def track_end(tracker: Tracker, folder: Path, results: Sequence[StepResult]) -> 
     tracker.metrics({f"eval/{name}": value for name, value in means.items() if value is not None})
     facts = {"train_seconds": table.facts.train_seconds, "peak_memory_mb": table.facts.peak_memory_mb}
     tracker.metrics({f"cost/{name}": value for name, value in facts.items() if value is not None})
+    if table.object is not None:
+        tracker.metrics({f"object/{name}": value for name, value in table.object.numbers().items()})
     tracker.metrics({"surfels": float(table.facts.surfels or 0)})
     tracker.table("eval", [{"view": row.view, **row.values} for row in table.rows])
     _track_sliders(tracker, results)

@@ -90,10 +90,10 @@ class _Candidates:
     def given(self) -> ObjectMesh:
         """The mesh of the file."""
         mesh = read_given(self.settings.given)
-        self.scores["given"] = self.score(mesh).mean
         side = float(np.ptp(mesh.vertices, axis=0).max()) if len(mesh.vertices) else 0.0
         if len(mesh.faces) == 0 or side == 0:
             raise RtgsError(f"{self.settings.given} holds no surface: mesh.object.given needs triangles")
+        self.scores["given"] = self.score(mesh).mean
         return ObjectMesh(mesh, "given", side / self.settings.hull.voxels, flat=self._flat(mesh))
 
     def _flat(self, mesh: TriangleMesh) -> bool:

@@ -26,6 +26,7 @@ _HOPELESS = 0.5  # agreement below which nothing is refined
 _VIEWS = 16  # evenly chosen, from which the plane is found
 _COARSE, _FINE, _MESH = 20, 40, 96  # points along each side of the patch of plane
 _STEPS = 100
+_BESIDE = 0.25  # of the picture: drawn panes are kept so far beyond its border
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,7 @@ def fit_pane(views: Sequence[MaskView]) -> Pane:
 
 
 def drawn_pane(polygons: Sequence[np.ndarray], views: Sequence[MaskView]) -> Pane:
-    """The pane that somebody drew: flat polygons (K, 3) in the world, as far as a view has them in the picture.
+    """The pane that somebody drew: flat polygons (K, 3) in the world, as far as a view has them in or near its picture.
 
     ``agreement`` is 1: nothing is looked for.
 
@@ -135,12 +136,12 @@ def _cut_out(corners: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray, 
 
 
 def _in_a_picture(points: np.ndarray, views: Sequence[MaskView]) -> np.ndarray:
-    """(N,) bool: at least one view has the point in its picture."""
+    """(N,) bool: at least one view has the point in its picture, or near it: other views will be rendered too."""
     seen = torch.zeros(len(points), dtype=torch.bool)
     for view in views:
         pixels, depth = view.camera.project(torch.from_numpy(points))
-        inside = (pixels >= 0).all(1) & (pixels[:, 0] <= view.camera.width) & (pixels[:, 1] <= view.camera.height)
-        seen |= (depth > 0) & inside
+        size = torch.tensor([view.camera.width, view.camera.height], dtype=pixels.dtype)
+        seen |= (depth > 0) & ((pixels / size - 0.5).abs() <= 0.5 + _BESIDE).all(1)
     return seen.numpy()
 
 

@@ -156,6 +156,10 @@ def test_given_meshes(tmp_path: Path) -> None:
         assert choice.mesh.source == "given"
         assert choice.iou.mean > 0.97
         assert choice.mesh.voxel == pytest.approx(1.6 / 40, rel=0.01)
+    nothing = TriangleMesh(np.zeros((3, 3), np.float32), np.zeros((0, 3), np.int32))
+    write_mesh_ply(tmp_path / "nothing.ply", nothing)
+    with pytest.raises(RtgsError, match=r"no faces|holds no surface"):
+        chosen("given", masks, replace(SETTINGS, given=str(tmp_path / "nothing.ply")))
     (tmp_path / "quad.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvn 0 0 1\nf 1/1/1 2//1 -2 4\n")
     assert len(read_mesh_obj(tmp_path / "quad.obj").faces) == 2
     (tmp_path / "points.obj").write_text("v 0 0 0\n")

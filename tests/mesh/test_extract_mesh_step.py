@@ -18,7 +18,7 @@ from rtgs.errors import RtgsError
 from rtgs.mesh.container import read_object_mesh
 from rtgs.mesh.hull import HullSettings
 from rtgs.mesh.settings import ObjectSettings
-from rtgs.mesh.triangles import read_mesh_ply, write_mesh_ply
+from rtgs.mesh.triangles import TriangleMesh, read_mesh_ply, write_mesh_ply
 from rtgs.mesh.tsdf import TsdfSettings
 from rtgs.methods import RenderedView, RenderOptions
 from rtgs.pipeline import StepContext
@@ -132,6 +132,19 @@ def test_object_mesh_without_any_mask_is_explained(context: StepContext) -> None
     save_scene(replace(everything, train=train), context.inputs["import_scene"])
     with pytest.raises(RtgsError, match="cover the whole picture"):
         step.extract_mesh(replace(PARAMS, only_masked=True, source="auto"), context)
+
+
+def test_an_empty_mesh_is_an_error_and_nothing_is_written(context: StepContext, tmp_path: Path) -> None:
+    save_scene(whole_masks(sphere_scene(masked=False)), context.inputs["import_scene"])
+    write_mesh_ply(tmp_path / "flat.ply", TriangleMesh(np.zeros((3, 3), np.float32), np.array([[0, 1, 2]])))
+    settings = ObjectSettings(given=str(tmp_path / "flat.ply"))
+    params = replace(PARAMS, tsdf=TsdfSettings(), only_masked=True, source="given", object=settings)
+    with pytest.raises(RtgsError, match="holds no surface"):
+        step.extract_mesh(params, context)
+    hopeless = replace(PARAMS, only_masked=True, tsdf=replace(PARAMS.tsdf, min_triangles=1_000_000))
+    with pytest.raises(RtgsError, match="no piece of 1000000 triangles"):
+        step.extract_mesh(hopeless, context)
+    assert not list(context.out.iterdir())
 
 
 def test_a_given_mesh_belongs_to_the_plan(tmp_path: Path) -> None:
