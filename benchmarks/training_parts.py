@@ -216,6 +216,20 @@ def whole_minutes(stages: Sequence[StageShares]) -> tuple[float, float]:
     return by_clock, sum(factor * stage.cpu_seconds for factor, stage in zip(scale, stages, strict=True))
 
 
+def shrunk_words(steps: int, words: Sequence[str]) -> list[str]:
+    """The preset's schedule in so many steps; whether a scene is matte is judged after as many steps as in the whole.
+
+    k_s needs those steps to tell mirrors from the rest: judged earlier, any scene loses its second stage.
+    """
+    from rtgs.config.compose import compose
+
+    config, choices = compose(list(words))
+    reflection = config.method.reflection
+    probation = reflection.matte.probation * config.schedule.total / steps
+    probation = min(probation, 0.5 * (1 - reflection.start))
+    return [*schedule_overrides(steps, choices.preset), f"method.reflection.matte.probation={probation:.6g}"]
+
+
 def table(stages: Sequence[StageShares]) -> str:
     """Markdown, a row per stage."""
     parts = [part for part in PARTS if any(part in stage.shares for stage in stages)]
@@ -240,7 +254,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1)
     options = parser.parse_args()
     words = [f"scene={options.scene}", f"method={options.method}", f"preset={options.preset}", *options.set]
-    shrunk = schedule_overrides(options.steps, options.preset) if options.steps else []
+    shrunk = shrunk_words(options.steps, words) if options.steps else []
     stages = measure(words, shrunk, options.threads)
     minutes, cpu_minutes = whole_minutes(stages)
     extrapolated = any(stage.steps != stage.preset_steps for stage in stages)
