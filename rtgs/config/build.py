@@ -6,6 +6,7 @@ import dataclasses
 import types
 import typing
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Any
 
 from rtgs.errors import RtgsError
@@ -17,7 +18,7 @@ def build(cls: type, values: Mapping[str, Any]) -> Any:
     Raises:
         RtgsError: a key that ``cls`` does not have.
     """
-    hints = typing.get_type_hints(cls)
+    hints = _hints(cls)
     unknown = sorted(set(values) - set(hints))
     if unknown:
         raise RtgsError(f"config: {cls.__name__} has no key {', '.join(unknown)}; it has {', '.join(hints)}")
@@ -28,6 +29,11 @@ def build(cls: type, values: Mapping[str, Any]) -> Any:
             if item.name in values
         }
     )
+
+
+@cache
+def _hints(cls: type) -> dict[str, Any]:
+    return typing.get_type_hints(cls)
 
 
 def _value(hint: Any, value: Any) -> Any:

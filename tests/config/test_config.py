@@ -4,21 +4,26 @@ import dataclasses
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
+from itertools import cycle, product
 from pathlib import Path
 
 import cloudpickle
 import pytest
 import yaml
+from hydra import compose as hydra_compose
+from hydra import initialize_config_dir
 from hydra.errors import HydraException
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from pipelines.graph import build_graph
 from rtgs.config import RunConfig, compose
 from rtgs.config.build import build
-from rtgs.config.convert import derive_name
+from rtgs.config.compose import VERSION_BASE
+from rtgs.config.convert import derive_name, to_run_config
 from rtgs.config.explain import explain
 from rtgs.config.locate import choices_of, conf_dir
-from rtgs.config.schema import open_schema
+from rtgs.config.schema import Choices, open_schema, register_schema
 from rtgs.config.sweep import compose_jobs
 from rtgs.errors import RtgsError
 from rtgs.evaluate.tables import PAPER_SCORES
@@ -171,11 +176,13 @@ def test_a_scene_is_named_after_its_folder(path, name):
     assert derive_name(path) == name
 
 
-def test_the_whole_product_composes_and_no_ablation_is_idle():
-    """Method x preset x ablation on one scene, every scene with two presets. A scene sets scene keys only (checked
-    below), which methods and ablations do not touch, so the two together cover the whole product. What an ablation
-    takes away is read by training: the key of its last step is another one, for every method it is for."""
-    methods = {name: ablation_file(name)["ablation"].get("methods") or choices_of("method") for name in ABLATIONS}
+def test_method_preset_and_ablation_compose_and_no_ablation_is_idle():
+    """Method x preset x ablation on one scene, composed by Hydra; what an ablation is not for is refused.
+
+    What an ablation takes away is read by training: the key of its last step is another one, for every method it is
+    for, with every preset. That scenes add nothing to this is the test after it; `-m slow` walks the product itself.
+    """
+    methods = {name: methods_of(name) for name in ABLATIONS}
     keys: dict[tuple[str, str, str], str] = {}
     with captures_read_once():
         for method in choices_of("method"):
@@ -197,21 +204,82 @@ def test_the_whole_product_composes_and_no_ablation_is_idle():
         if ablation != "none":
             assert key != keys[method, preset, "none"], f"ablation {ablation} changes nothing in {method} {preset}"
     assert len(set(keys.values())) == len(keys), "two ablations of a method are the same"
+
+
+def test_scenes_share_nothing_with_methods_and_ablations():
+    """Every scene composes; of the other files only presets touch a scene, and of it only its size.
+
+    Scenes and methods set nothing but their own keys (tests below), so a scene adds to method x preset x ablation
+    nothing but its own part with the size of the preset.
+    """
+    for group in ("preset", "ablation"):
+        for name in choices_of(group):
+            content = yaml.safe_load((conf_dir() / group / f"{name}.yaml").read_text())
+            assert set(content.get("scene", {})) <= ({"long_side"} if group == "preset" else set()), name
     for job in compose_jobs([f"scene={','.join(SCENES)}", "preset=smoke,paper"], multirun=True)[0]:
         assert job.choices is not None, job.problem
         assert job.choices.scene
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scene", SCENES)
-def test_every_single_combination_composes(scene):
-    """The product itself, which the test above covers by what may touch what: method x preset x ablation of a scene."""
-    words = [f"method={','.join(choices_of('method'))}", f"preset={','.join(choices_of('preset'))}"]
-    jobs, _ = compose_jobs([f"scene={scene}", *words, f"ablation={','.join(choices_of('ablation'))}"], multirun=True)
-    assert len(jobs) == len(choices_of("method")) * len(choices_of("preset")) * len(choices_of("ablation"))
-    refused = [job.problem for job in jobs if job.config is None]
-    assert all("takes nothing away from method" in problem for problem in refused), refused
-    assert len({job.title for job in jobs if job.config}) == len(jobs) - len(refused)
+def test_the_whole_product_composes():
+    """Method x scene x preset x ablation, every combination a config of its own.
+
+    Hydra composes method x preset x ablation and scene x preset; the scene's part is put into each of the former and
+    the whole converted again. For some combinations, every file among them, Hydra composes all of it beside.
+    """
+    methods, presets, ablations = (choices_of(group) for group in ("method", "preset", "ablation"))
+    combinations = list(product(methods, presets, ablations))
+    of = raw_configs("method preset ablation", combinations)
+    scenes = raw_configs("scene preset", list(product(SCENES, presets)))
+    beside, names = beside_hydra(), set()
+    refused: dict[tuple[str, ...], str] = {}
+    for (method, preset, ablation), composed in of.items():
+        for scene in SCENES:
+            key = (scene, method, preset, ablation)
+            composed.scene = scenes[scene, preset].scene
+            choices = Choices(scene_file=scene, method=method, preset=preset, ablation=ablation)
+            try:
+                config, choices = to_run_config(composed, choices)
+            except RtgsError as error:
+                refused[key] = str(error)
+                continue
+            names.add((scene, config.name))
+            if key in beside:
+                assert (config, choices) == compose(words_of("scene method preset ablation", key))
+    assert len(names) + len(refused) == len(combinations) * len(SCENES)
+    for (_, method, _, ablation), problem in refused.items():
+        assert f"ablation={ablation} takes nothing away from method {method}" in problem
+    unfit = {(name, method) for name in ABLATIONS for method in methods if method not in methods_of(name)}
+    assert {(ablation, method) for _, method, _, ablation in refused} == unfit
+
+
+def beside_hydra() -> set[tuple[str, ...]]:
+    """Combinations among which every file comes up, and every method with every ablation that is for it."""
+    scenes, presets = cycle(SCENES), cycle(choices_of("preset"))
+    pairs = product(choices_of("method"), choices_of("ablation"))
+    fit = [(method, name) for method, name in pairs if name == "none" or method in methods_of(name)]
+    return {(next(scenes), method, next(presets), name) for method, name in fit}
+
+
+def words_of(groups: str, names: Sequence[str]) -> list[str]:
+    """``group=name`` of each."""
+    return [f"{group}={name}" for group, name in zip(groups.split(), names, strict=True)]
+
+
+def raw_configs(groups: str, keys: Sequence[tuple[str, ...]]) -> dict[tuple[str, ...], DictConfig]:
+    """What Hydra composes for each choice of files, before it is converted."""
+    register_schema()
+    with initialize_config_dir(str(conf_dir()), version_base=VERSION_BASE):
+        found = {key: hydra_compose("config", overrides=words_of(groups, key)) for key in keys}
+    for composed in found.values():
+        OmegaConf.set_readonly(composed, False)
+    return found
+
+
+def methods_of(ablation: str) -> tuple[str, ...]:
+    """The methods that have what an ablation takes away."""
+    return tuple(ablation_file(ablation)["ablation"].get("methods") or choices_of("method"))
 
 
 def ablation_file(name: str) -> dict:
