@@ -10,6 +10,7 @@ from rtgs.evaluate.evaluate import EvaluationTable
 from rtgs.evaluate.tables import PAPER_SCORES, PaperScore
 
 STAND_IN, PAPER_DATA, OWN_DATA = "stand_in", "paper", "own"
+PAPER_PRESET = "paper"  # the preset that is the published schedule
 DATA_KINDS = (STAND_IN, PAPER_DATA, OWN_DATA)
 
 

@@ -17,6 +17,7 @@ from rtgs.evaluate.publish import (
     COSTS,
     MESH,
     PAPER_DATA,
+    PAPER_PRESET,
     QUALITY,
     STAND_IN,
     TRUTH,
@@ -62,19 +63,27 @@ def _marked(text: str, rank: int | None, marks: Mapping[int, tuple[str, str]]) -
 def notes(table: PaperTable) -> tuple[str, ...]:
     """What a reader must know, one sentence each."""
     cells = list(table.cells.values())
-    sizes = sorted({f"{cell.scene} {cell.resolution}" for cell in cells})
+    sizes = dict.fromkeys(f"{cell.scene} {cell.resolution}, {cell.views} test views" for cell in cells)
     presets = sorted({cell.preset for cell in cells})
     seeds = sorted({len(cell.seeds) for cell in cells})
-    found = [f"Preset {', '.join(presets)}; {', '.join(sizes)}; {cells[0].views} test views."]
+    found = [f"Preset {', '.join(presets)}; {'; '.join(sizes)}."]
+    if any(cell.paper is not None for cell in cells) and presets != [PAPER_PRESET]:
+        found.append(
+            f"The paper's figures are those of its whole schedule (preset {PAPER_PRESET}): differences of preset "
+            f"{', '.join(presets)} to them are no verdict."
+        )
     if table.spec.data == STAND_IN:
         found.append(
             "The scenes are path-traced stand-ins named after the paper's: its figures are for other data and not "
             "comparable, so they are not shown."
         )
     if max(seeds) > 1:
-        found.append(f"Mean ± sample standard deviation over {max(seeds)} seeds; smaller differences are noise.")
+        fewer = f" ({seeds[0]} where runs are missing)" if len(seeds) > 1 else ""
+        found.append(f"Mean ± sample standard deviation over {max(seeds)} seeds{fewer}; smaller differences are noise.")
     else:
         found.append("One seed: differences of a few hundredths of a dB are noise.")
+    if len(cells) < len(table.methods) * len(table.scenes):
+        found.append("Empty cells: the run failed, or was not asked for.")
     absent = [metric.title for metric in QUALITY if all(cell.values[metric.key] is None for cell in cells)]
     if absent:
         found.append(f"{', '.join(absent)}: not measured (`rtgs weights` says what is missing).")
@@ -112,16 +121,28 @@ def _paper_rows(table: PaperTable) -> list[list[str]]:
         for cell in cells:
             paper = None if cell is None else cell.paper
             row.append("" if paper is None else f"{paper.psnr:.2f} / {paper.ssim:.3f} / {paper.lpips:.3f}")
-            ours = None if cell is None else cell.values["psnr"]
-            row.append("" if paper is None or ours is None else f"{ours.mean - paper.psnr:+.2f}")
+            row.append("" if cell is None or paper is None else _difference(cell))
         rows.append(row)
     return rows
+
+
+def _differences(cell: Cell) -> list[float | None]:
+    """Ours minus the paper's PSNR, SSIM and LPIPS; None where one of them is not there."""
+    paper = cell.paper
+    theirs = (None, None, None) if paper is None else (paper.psnr, paper.ssim, paper.lpips)
+    ours = [cell.values[metric.key] for metric in QUALITY]
+    return [None if value is None or other is None else value.mean - other for value, other in zip(ours, theirs)]
+
+
+def _difference(cell: Cell) -> str:
+    found = zip(_differences(cell), QUALITY)
+    return " / ".join(NOT_AVAILABLE if value is None else f"{value:+.{metric.digits}f}" for value, metric in found)
 
 
 def _paper_header(table: PaperTable) -> list[str]:
     header = ["method"]
     for scene in table.scenes:
-        header += [f"{scene}: paper's PSNR / SSIM / LPIPS", f"{scene}: PSNR, ours - paper's"]
+        header += [f"{scene}: paper's PSNR / SSIM / LPIPS", f"{scene}: ours - paper's"]
     return header
 
 
@@ -169,7 +190,8 @@ def _escaped_pipe(text: str) -> str:
     return text.replace("|", "\\|")
 
 
-_PAPER_COLUMNS = ("paper_psnr", "paper_ssim", "paper_lpips", "psnr_minus_paper")
+_PAPER_COLUMNS = ("paper_psnr", "paper_ssim", "paper_lpips")
+_PAPER_COLUMNS += ("psnr_minus_paper", "ssim_minus_paper", "lpips_minus_paper")
 
 
 def comma_separated(table: PaperTable) -> str:
@@ -195,10 +217,9 @@ def _csv_row(spec: TableSpec, cell: Cell, metrics: Sequence[Metric]) -> list[obj
         row.append(cell.ranks.get(metric.key, ""))
     if spec.data != PAPER_DATA:
         return row
-    paper, ours = cell.paper, cell.values["psnr"]
+    paper = cell.paper
     row += ["", "", ""] if paper is None else [paper.psnr, paper.ssim, paper.lpips]
-    row.append("" if paper is None or ours is None else repr(ours.mean - paper.psnr))
-    return row
+    return row + ["" if value is None else repr(value) for value in _differences(cell)]
 
 
 def latex(table: PaperTable) -> str:

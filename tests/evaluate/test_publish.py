@@ -10,11 +10,21 @@ from rtgs.evaluate.publish import Measured, TableSpec, build_table
 from rtgs.evaluate.table_formats import comma_separated, latex, markdown, page, write_table
 
 
-def run(method: str, scene: str, psnr: float, *, seed: int = 0, lpips: float | None = 0.2, masked: float | None = None):
+def run(
+    method: str,
+    scene: str,
+    psnr: float,
+    *,
+    seed: int = 0,
+    lpips: float | None = 0.2,
+    masked: float | None = None,
+    views: int = 2,
+    preset: str = "quick",
+) -> Measured:
     values: dict[str, float | None] = dict.fromkeys(METRICS)
     values |= {"psnr": psnr, "ssim": 0.9, "lpips_01": lpips, "psnr_masked": masked}
-    rows = tuple(ViewScore(f"{k}.png", 64, 48, None, dict(values)) for k in range(2))
-    facts = RunFacts(scene, method, "quick", 2000, 1000, 60.0, 500.0)
+    rows = tuple(ViewScore(f"{k}.png", 64, 48, None, dict(values)) for k in range(views))
+    facts = RunFacts(scene, method, preset, 2000, 1000, 60.0, 500.0)
     return Measured(EvaluationTable(facts, rows), seed, paper_scene={"ball_statue": "ballstatue"}.get(scene, scene))
 
 
@@ -67,7 +77,7 @@ def test_the_papers_columns_exist_only_on_the_papers_data(tmp_path, data):
         path.suffix: path.read_text() for path in write_table(tmp_path, build_table(TableSpec("t", "T", "paper"), runs))
     }
     assert "26.20 / 0.728 / 0.298" in same[".md"]
-    assert "| +3.80 |" in same[".md"]
+    assert "| +3.80 / +0.172 / -0.098 |" in same[".md"]
     assert "& +3.80" in same[".tex"]
     assert "<td>+3.80" in same[".html"]
     sedan = next(row for row in csv.DictReader(io.StringIO(same[".csv"])) if row["scene"] == "sedan")
@@ -94,10 +104,31 @@ def test_first_second_and_third_are_marked_in_every_format(tmp_path):
 
 def test_on_the_papers_data_the_difference_has_its_own_column():
     table = build_table(TableSpec("table2", "Table 2", "paper"), [run("rtgs", "ball_statue", 26.153)])
-    assert "| +0.10 |" in markdown(table)
+    assert "| +0.10 / +0.015 / +0.026 |" in markdown(table)
     row = next(csv.DictReader(io.StringIO(comma_separated(table))))
-    assert float(row["psnr_minus_paper"]) == pytest.approx(0.1)
+    differences = [float(row[f"{name}_minus_paper"]) for name in ("psnr", "ssim", "lpips")]
+    assert differences == pytest.approx([0.1, 0.015, 0.026])
     assert "stand-in" not in markdown(table)
+    without = build_table(TableSpec("table2", "Table 2", "paper"), [run("rtgs", "ball_statue", 26.153, lpips=None)])
+    assert "| +0.10 / +0.015 / n/a |" in markdown(without)
+
+
+def test_another_schedule_than_the_papers_is_told_beside_its_figures():
+    quick, whole = (
+        markdown(build_table(TableSpec("t", "T", "paper"), [run("rtgs", "sedan", 26.0, preset=preset)]))
+        for preset in ("quick", "paper")
+    )
+    assert "differences of preset quick to them are no verdict" in quick
+    assert "no verdict" not in whole
+
+
+def test_notes_tell_views_of_each_scene_fewer_seeds_and_empty_cells():
+    runs = [run("rtgs", "a", 30.0, views=3, seed=seed) for seed in range(2)] + [run("2dgs", "b", 29.0)]
+    text = markdown(build_table(STAND_IN, runs))
+    assert "Preset quick; a 64x48, 3 test views; b 64x48, 2 test views." in text
+    assert "over 2 seeds (1 where runs are missing)" in text
+    assert "Empty cells: the run failed, or was not asked for." in text
+    assert "Empty cells" not in markdown(build_table(STAND_IN, runs[:2]))
 
 
 def test_own_scenes_have_no_paper():
