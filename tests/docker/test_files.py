@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -52,9 +53,24 @@ def test_ports_are_published_on_loopback_unless_told_otherwise():
 
 def test_every_service_has_a_health_check_and_is_not_root():
     for name, service in services().items():
-        one_shot = name in ("buckets", "rtgs")
+        one_shot = name in ("volume", "buckets", "rtgs")
         assert one_shot or "healthcheck" in service, name
         assert service.get("user") not in (None, "root", "0"), name
+
+
+def test_the_health_check_of_a_worker_fails_where_there_is_none():
+    """A shell that looks for a command line finds its own."""
+    if shutil.which("pgrep") is None:
+        pytest.skip("no pgrep here (procps)")
+    kind, command = services()["worker"]["healthcheck"]["test"]
+    assert kind == "CMD-SHELL"
+    wrapped = ["sh", "-c", command + "; exit $?"]  # no shell may replace itself by the last command
+    assert subprocess.run(wrapped).returncode == 1
+    stand_in = subprocess.Popen([sys.executable, "-c", "input()", "dask worker"], stdin=subprocess.PIPE)
+    try:
+        assert subprocess.run(wrapped).returncode == 0
+    finally:
+        stand_in.communicate()
 
 
 def test_no_password_has_a_default_and_every_variable_is_documented():
