@@ -55,7 +55,7 @@ class Executions:
             if not lines:
                 continue  # killed before its first line
             start = json.loads(lines[0])
-            ended = '"kind": "end"' in lines[-1]
+            ended = '"status": "finished"' in lines[-1]  # else cut, or failed, which a sweep that succeeds has none of
             (found.finished if ended else found.cut)[start["fingerprint"]] += 1
         return found
 
@@ -125,10 +125,11 @@ def _through(process: subprocess.Popen[bytes], root: Path, moment: float | None)
 
 
 def with_checkpoints(root: Path) -> set[str]:
-    """Fingerprints of trainings that have a checkpoint of their own and no artifact yet."""
+    """Fingerprints of trainings that have a checkpoint and no artifact yet."""
     found = set()
     for folder in (root / "store").glob("train_*/partial/*"):
-        if any(folder.glob("checkpoints/step_*")):
+        published = folder.parents[1] / folder.name[:2] / folder.name / "manifest.json"  # killed between the two
+        if any(folder.glob("checkpoints/step_*")) and not published.exists():
             found.add(folder.name)
     return found
 
@@ -141,34 +142,39 @@ def killed_sweep(
     Returns how many kills hit, and the fingerprints of trainings that had a checkpoint when they were cut.
 
     Raises:
-        RuntimeError: the last start, which nobody kills, fails.
+        RuntimeError: a start that nobody kills fails.
     """
     kills, checkpoints = 0, set()
     log = root / "log.txt"
     for seconds, whole_group in moments:
         process = start(root, words, log)
         if _through(process, root, seconds):
+            _succeeded(process, kills, log)
             break
         kill(process, whole_group)
         kills += 1
         checkpoints |= with_checkpoints(root)
-    last = start(root, words, log)
-    if last.wait() != 0:
-        raise RuntimeError(f"the sweep fails after {kills} kills: {log.read_text(encoding='utf-8')[-2000:]}")
+    _succeeded(start(root, words, log), kills, log)
     return kills, checkpoints
 
 
+def _succeeded(process: subprocess.Popen[bytes], kills: int, log: Path) -> None:
+    if process.wait() != 0:
+        raise RuntimeError(f"the sweep fails after {kills} kills: {log.read_text(encoding='utf-8')[-2000:]}")
+
+
 def judge(root: Path, expected: list[dict[str, str]], checkpoints: set[str], tally: Tally) -> None:
-    """Count what came of one folder."""
+    """Count what came of one folder. Trainings of later stages start from a checkpoint anyway, and do not count."""
     executions = Executions.of(root)
     tally.finished += 1
     tally.tables_equal += table_of(root) == expected
     tally.steps_finished_twice += sum(count > 1 for count in executions.finished.values())
     tally.cut += sum(executions.cut.values())
-    tally.cut_with_checkpoint += len(checkpoints)
     for artifact in Store(root / "store").artifacts():
-        if artifact.manifest.fingerprint in checkpoints:
+        manifest = artifact.manifest
+        if manifest.fingerprint in checkpoints and manifest.params["from_step"] == 0:
             summary = json.loads((artifact.folder / "summary.json").read_text(encoding="utf-8"))
+            tally.cut_with_checkpoint += 1
             tally.resumed += summary["resumed_from"] is not None
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import sys
+from contextlib import nullcontext
 
 import pytest
 
@@ -35,3 +36,20 @@ def test_tracking(monkeypatch, capsys, tmp_path):
     assert figures["metric_calls"] == 3
     assert 0 < figures["share"] < 1
     assert figures["share"] == pytest.approx(figures["share_metrics"] + figures["share_pictures"], abs=1e-4)
+    assert figures["around_s"] > 0
+
+
+def test_the_watch_counts_each_moment_once(monkeypatch):
+    """A timed call inside another is part of it; of a context only its ends count; inside and around are told apart."""
+    now = iter(range(100))
+    monkeypatch.setattr(tracking.time, "perf_counter", lambda: next(now))
+    watch = tracking.Watch()
+    inner = watch.timed(lambda: None, watch.metrics)
+    outer = watch.timed(inner, watch.rest)
+    outer()
+    assert (watch.rest.around, watch.metrics.around) == (1, 0)
+    with watch.timed_ends(lambda: nullcontext(5), watch.rest)() as value:
+        assert value == 5
+        watch.trained(inner)()
+    assert watch.rest.around == 3  # one more for each end
+    assert (watch.metrics.inside, watch.metrics.calls, watch.metrics.around) == (1, 1, 0)
