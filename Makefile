@@ -22,8 +22,12 @@ SCENES_nu_nerf := scene=nu_nerf/ballstatue,nu_nerf/popcorncup,nu_nerf/real_bottl
 # with the papers' data: what is missing is listed with where it belongs, and nothing starts, unless RUN names the scenes
 SOME_SCENES = $(findstring scene=,$(RUN))
 CHECK_DATA = $(if $(filter-out stand_in,$(DATA)),$(if $(SOME_SCENES),,$(BIN)/rtgs check data=$(DATA) $(SCENES_$(DATA))))
+# recipes expand this first; its argument is the dataset of the table's paper scenes
+of_data = $(if $(filter stand_in $(1),$(DATA)),,$(error DATA=$(DATA): this table is of stand_in or $(1)))
 DATA_WORDS = $(if $(SOME_SCENES),,$(SCENES_$(DATA))) $(if $(filter-out stand_in,$(DATA)),table.data=paper)
-TABLE = $(BIN)/rtgs run preset=$(PRESET) $(SEED_LIST) hydra.launcher.workers=$(WORKERS) $(DATA_WORDS)
+# another launcher comes with options of its own: RUN='hydra/launcher=rtgs_cluster', RUN='hydra/launcher=joblib threads=1'
+WORKER_WORDS = $(if $(findstring hydra/launcher=,$(RUN)),,hydra.launcher.workers=$(WORKERS))
+TABLE = $(BIN)/rtgs run preset=$(PRESET) $(SEED_LIST) $(WORKER_WORDS) $(DATA_WORDS)
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test e2e bench lint format dashboard accept-steps contact-sheet clean
@@ -49,21 +53,21 @@ demo: setup ## train the embedded glass scene, end with a page of pictures and n
 	$(BIN)/rtgs run scene=demo method=rtgs preset=quick $(RUN)
 
 reproduce-table1: setup ## mirrors: every method on every scene, ends with tables/table1-PRESET (PRESET= SEEDS= DATA= WORKERS=)
-	$(CHECK_DATA)
+	$(call of_data,ref_real)$(CHECK_DATA)
 	$(TABLE) experiment=table1 $(RUN)
 
 reproduce-table2: setup ## thin glass: the same for Table 2
-	$(CHECK_DATA)
+	$(call of_data,nu_nerf)$(CHECK_DATA)
 	$(TABLE) experiment=table2 $(RUN)
 
 reproduce-table3: SCENES_nu_nerf := scene=nu_nerf/ballstatue
 reproduce-table3: setup ## what each part of the third stage is worth
-	$(CHECK_DATA)
+	$(call of_data,nu_nerf)$(CHECK_DATA)
 	$(TABLE) experiment=table3 $(RUN)
 
 reproduce-fig-split-sum: SCENES_ref_real := scene=ref_real/sedan
 reproduce-fig-split-sum: setup ## microfacet weight against split-sum shading
-	$(CHECK_DATA)
+	$(call of_data,ref_real)$(CHECK_DATA)
 	$(TABLE) experiment=fig_split_sum $(RUN)
 
 test: setup ## the tests

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import sys
+from collections import Counter
 from collections.abc import Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from pipelines.planning import describe, jobs_of_words, remote_store
-from pipelines.sweep import Sweep, current_sweep, prepared_outcomes
+from pipelines.sweep import Sweep, SweepStart, current_sweep, prepared_outcomes
 from pipelines.words import friendly_overrides
 from rtgs.config.compose import VERSION_BASE, choices_from
 from rtgs.config.convert import to_run_config
@@ -86,26 +87,35 @@ def _run(
 
 
 def _recorded(config: RunConfig, plan: Plan, tracking: Tracking) -> bool:
-    """Nothing to record: nothing is left to run, and the tracker saw this variant when it was run.
+    """Nothing to record: nothing is left to run, and the tracker has this variant.
 
-    A job of a sweep is looked up in its experiment, which may be another than the one it was recorded in; a single run
-    is not, so that repeating it stays quick.
+    A job of a sweep is looked up in its experiment; a single run by what its folder says, so that repeating it stays
+    quick: trackers take seconds to import.
     """
+    from pipelines.results import is_tracked
+
     if not plan.complete or prepared_outcomes().executed(plan):
         return False
-    return current_sweep() is None or tracking.finished(config.tracking.experiment, plan.steps[-1].step.fingerprint)
+    if current_sweep() is None:
+        return config.tracking.kind == "off" or is_tracked(config, plan, _place(config, tracking))
+    return tracking.finished(config.tracking.experiment, plan.steps[-1].step.fingerprint)
+
+
+def _place(config: RunConfig, tracking: Tracking) -> str:
+    return f"{tracking.place}: {config.tracking.experiment}"
 
 
 def _tracked(
     config: RunConfig, choices: Choices, stores: _Stores, plan: Plan, command: str, tracking: Tracking, parent: str
 ) -> tuple[tuple[StepResult, ...], Path]:
-    from pipelines.results import run_info, track_end, track_start, write_run_folder
+    from pipelines.results import note_tracked, run_info, track_end, track_start, write_run_folder
 
     with tracking.run(run_info(config, choices, plan, parent)) as tracker:
-        track_start(tracker, config, choices, plan)
+        track_start(tracker, config, choices, prepared_outcomes().as_planned(plan))
         results = InlineExecutor(stores.local, tracking, stores.remote).execute(plan)
         folder = write_run_folder(config, choices, command, results)
         track_end(tracker, folder, results)
+    note_tracked(folder, _place(config, tracking))
     return results, folder
 
 
@@ -141,7 +151,6 @@ class HydraApp:
         self.error: Exception | None = None
         self.outcomes: list[RunOutcome] = []
         self.failures: list[str] = []
-        self.sweep: Sweep | None = None
 
     def __call__(self, composed: DictConfig) -> None:
         """One job."""
@@ -149,7 +158,7 @@ class HydraApp:
         from hydra.types import RunMode
 
         hydra = HydraConfig.get()
-        self.sweep = current_sweep()
+        sweep = current_sweep()
         try:
             config, choices = to_run_config(composed, choices_from(hydra.runtime.choices, hydra.overrides.task))
             self.outcomes.append(execute(config, choices))
@@ -157,32 +166,50 @@ class HydraApp:
             if hydra.mode == RunMode.MULTIRUN:
                 self.failures.append(f"job {hydra.job.num} ({hydra.job.override_dirname}): {error}")
                 log.error("%s", self.failures[-1])
+                if sweep is not None:
+                    sweep.leave_error(int(hydra.job.num), error)
                 raise
             self.error = error
 
     def summary(self, words: Sequence[str]) -> str:
-        """Table and failures of a sweep; empty for a single run. ``words``: of the command line."""
-        if not self.outcomes and not self.failures and self.error is None:
+        """Table and failures of a sweep; of a single run only the table, if one is asked for.
+
+        ``words``: of the command line.
+        """
+        if SweepStart.sweep is not None and SweepStart.sweep.elsewhere:
             self.outcomes, self.failures = finished_elsewhere(words)
-        if len(self.outcomes) + len(self.failures) < 2:
-            return ""
+        total = len(self.outcomes) + len(self.failures)
+        parts = []
+        if self.outcomes and total > 1:
+            parts.append(self._side_by_side())
+        if overwritten := self._same_folder():
+            parts.append(f"several jobs have the run folder {', '.join(overwritten)}, the last one's results are there")
+        try:
+            parts += ["\n".join(f"table: {_short(path)}" for path in self.tables())]
+        except ValueError as error:  # what else there is to tell is told
+            self.error = error
+        if self.failures and total > 1:
+            parts.append("\n".join([f"{len(self.failures)} of {total} jobs failed:", *self.failures]))
+        return "\n\n".join(part for part in parts if part)
+
+    def _same_folder(self) -> list[str]:
+        """Jobs that differ in keys which are not part of a run's name."""
+        count = Counter(outcome.folder for outcome in self.outcomes)
+        return [_short(folder) for folder in count if count[folder] > 1]
+
+    def _side_by_side(self) -> str:
         from pipelines.results import evaluation_of, result_table
 
-        parts = [result_table([evaluation_of(outcome.results) for outcome in self.outcomes])] if self.outcomes else []
-        if paths := self.tables():
-            parts.append("\n".join(f"table: {_short(path)}" for path in paths))
-        if self.failures:
-            total = len(self.outcomes) + len(self.failures)
-            parts.append("\n".join([f"{len(self.failures)} of {total} jobs failed:", *self.failures]))
-        return "\n\n".join(parts)
+        tables = [evaluation_of(outcome.results) for outcome in self.outcomes]
+        return result_table(tables, [outcome.config.seed for outcome in self.outcomes])
 
     def tables(self) -> list[Path]:
         """Write the table that the experiment asks for, of the jobs that succeeded; the paths written."""
         from pipelines.tables import write_experiment_table
 
         paths = write_experiment_table([(outcome.config, outcome.results) for outcome in self.outcomes])
-        if paths and self.sweep is not None:
-            _track_table(self.outcomes[0].config, self.sweep, paths)
+        if paths and SweepStart.sweep is not None:
+            _track_table(self.outcomes[0].config, SweepStart.sweep, paths)
         return paths
 
 
@@ -198,15 +225,15 @@ def finished_elsewhere(words: Sequence[str]) -> tuple[list[RunOutcome], list[str
     except (RtgsError, HydraException):
         return [], []
     outcomes, failures = [], []
-    for job in jobs if sweep else ():
+    for number, job in enumerate(jobs if sweep else ()):
         try:
-            outcomes.append(_left_by(job))
+            outcomes.append(_left_by(job, number))
         except Exception as error:  # whatever it is, the job has stopped with it
-            failures.append(f"{job.title}: {error}")
+            failures.append(f"job {number} ({','.join(job.words)}): {error}")
     return outcomes, failures
 
 
-def _left_by(job: ComposedJob) -> RunOutcome:
+def _left_by(job: ComposedJob, number: int) -> RunOutcome:
     from pipelines.graph import build_graph
 
     if job.config is None or job.choices is None:
@@ -220,7 +247,8 @@ def _left_by(job: ComposedJob) -> RunOutcome:
     )
     if len(results) < len(plan):
         first = next(planned.step for planned in plan if not planned.hit)
-        raise RtgsError(f"did not finish ({first.label} is missing); its own log says why: outputs/sweeps/")
+        lost = f"did not finish ({first.label} is missing) and left no error: was it killed?"
+        raise RtgsError((SweepStart.sweep and SweepStart.sweep.error_of(number)) or lost)
     return RunOutcome(job.config, plan, results, job.config.paths.runs / str(job.config.name))
 
 
@@ -230,7 +258,7 @@ def run_hydra(arguments: Sequence[str]) -> None:
 
     register_schema()
     _know_own_launcher()
-    app = HydraApp()
+    app, SweepStart.sweep = HydraApp(), None
 
     def task(composed: DictConfig) -> None:
         app(composed)

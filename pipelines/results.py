@@ -6,7 +6,7 @@ import json
 import shutil
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from filelock import FileLock
 
 from pipelines.evaluate import TABLE_CSV, TABLE_JSON
+from pipelines.listing import columns
 from pipelines.pictures import final_pictures, training_pictures
 from pipelines.report import PAGE
 from pipelines.training import read_history, stage_params
@@ -24,7 +25,7 @@ from rtgs.pipeline import Plan, StepResult, Store
 from rtgs.prepare.masks_report import FILES as MASK_FILES
 from rtgs.prepare.quality import PICTURE_FILE, REPORT_FILE
 from rtgs.track import RunInfo, Tracker
-from rtgs.track.source import git_tags
+from rtgs.track.source import git_tags, installed
 
 if TYPE_CHECKING:
     from pipelines.preparation import SkippedStep
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 
 RUN_FILE = "run.json"
 CONFIG_FILE = "config.yaml"
+INSTALLED_FILE = "requirements.txt"
 _TRACKED_IMAGES = 4
 _NOT_TOLD = ("paths.", "tracking.", "table.")  # where results go, not what they are
 
@@ -45,13 +47,33 @@ class RunRecord:
     finished: str  # UTC, ISO 8601
     choices: dict[str, Any]
     steps: dict[str, str]  # fingerprint by step name
+    tracked: tuple[str, ...] = ()  # places that hold a record of this run with these steps
 
     @staticmethod
     def read(folder: Path) -> RunRecord | None:
         """The record of a run folder, or None where there is none."""
         with suppress(OSError, ValueError, TypeError):
-            return RunRecord(**json.loads((folder / RUN_FILE).read_text(encoding="utf-8")))
+            record = RunRecord(**json.loads((folder / RUN_FILE).read_text(encoding="utf-8")))
+            return replace(record, tracked=tuple(record.tracked))
         return None
+
+
+def note_tracked(folder: Path, place: str) -> None:
+    """Write into the record of a run folder that the tracker at ``place`` has this run."""
+    record = RunRecord.read(folder)
+    if record is not None and place not in record.tracked:
+        _write_record(folder, replace(record, tracked=(*record.tracked, place)))
+
+
+def is_tracked(config: RunConfig, plan: Plan, place: str) -> bool:
+    """Whether the tracker at ``place`` has the run of this name with these steps, by the record of its folder."""
+    record = RunRecord.read(config.paths.runs / str(config.name))
+    steps = {planned.step.name: planned.step.fingerprint for planned in plan}
+    return record is not None and record.steps == steps and place in record.tracked
+
+
+def _write_record(folder: Path, record: RunRecord) -> None:
+    (folder / RUN_FILE).write_text(json.dumps(asdict(record), indent=1) + "\n", encoding="utf-8")
 
 
 def write_run_folder(config: RunConfig, choices: Choices, command: str, results: Sequence[StepResult]) -> Path:
@@ -80,6 +102,8 @@ def _fill_run_folder(
         return folder
     folder.mkdir(parents=True, exist_ok=True)
     (folder / RUN_FILE).unlink(missing_ok=True)  # written last: a folder without it is incomplete
+    for left in (*folder.glob("*.ply"), *folder.glob("mesh.*")):  # of another run of this name, with other stages
+        left.unlink(missing_ok=True)
     places = folders(results)
     shutil.copyfile(places["report"] / PAGE, folder / PAGE)
     for name in (TABLE_JSON, TABLE_CSV):
@@ -97,7 +121,7 @@ def _fill_run_folder(
     (folder / CONFIG_FILE).write_text(config_yaml(config), encoding="utf-8")
     finished = datetime.now(UTC).isoformat(timespec="seconds")
     record = RunRecord(str(config.name), command, finished, asdict(choices), steps)
-    (folder / RUN_FILE).write_text(json.dumps(asdict(record), indent=1) + "\n", encoding="utf-8")
+    _write_record(folder, record)
     return folder
 
 
@@ -134,18 +158,20 @@ def evaluation_of(results: Sequence[StepResult]) -> EvaluationTable:
     return read_json(folders(results)["evaluate"] / TABLE_JSON)
 
 
-def result_table(tables: Sequence[EvaluationTable]) -> str:
-    """Runs side by side in plain text; a figure that was not measured is ``n/a``."""
+def result_table(tables: Sequence[EvaluationTable], seeds: Sequence[int] = ()) -> str:
+    """Runs side by side in plain text; what was not measured is ``n/a``. ``seeds``: shown where they differ."""
     from rtgs.evaluate.tables import summarize
 
-    header = ("scene", "method", "preset", "views", "PSNR", "SSIM", "LPIPS", "train", "memory", "surfels")
-    rows: list[tuple[str, ...]] = [header]
-    for row in summarize(tables):
+    seeded = len(set(seeds)) > 1
+    header = ("scene", "method", "preset", *(["seed"] if seeded else []), "views", "PSNR", "SSIM", "LPIPS")
+    rows: list[tuple[str, ...]] = [(*header, "train", "memory", "surfels")]
+    for index, row in enumerate(summarize(tables)):
         rows.append(
             (
                 row.scene,
                 row.method,
                 row.preset,
+                *([str(seeds[index])] if seeded else []),
                 f"{row.views} of {row.resolution}" if row.views else "none",
                 _figure(row.psnr, "{:.2f} dB"),
                 _figure(row.ssim, "{:.4f}"),
@@ -155,8 +181,7 @@ def result_table(tables: Sequence[EvaluationTable]) -> str:
                 _figure(row.surfels, "{:,}"),
             )
         )
-    widths = [max(len(row[column]) for row in rows) for column in range(len(header))]
-    return "\n".join("  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip() for row in rows)
+    return columns(rows)
 
 
 def _figure(value: float | None, form: str) -> str:
@@ -173,12 +198,13 @@ def run_info(config: RunConfig, choices: Choices, plan: Plan, parent: str = "") 
 
 
 def track_start(tracker: Tracker, config: RunConfig, choices: Choices, plan: Plan) -> None:
-    """What a person tells runs apart by as parameters; the whole config as ``config.yaml``, and the plan."""
+    """What a person tells runs apart by as parameters; the whole config, what is installed, and the plan."""
     tracker.params(told_apart(config, choices))
     with TemporaryDirectory() as folder:
-        path = Path(folder) / CONFIG_FILE
-        path.write_text(config_yaml(config), encoding="utf-8")
-        tracker.artifact(path)
+        for name, text in ((CONFIG_FILE, config_yaml(config)), (INSTALLED_FILE, installed())):
+            path = Path(folder) / name
+            path.write_text(text, encoding="utf-8")
+            tracker.artifact(path)
     tracker.table("plan", plan_rows(plan))
 
 
@@ -219,9 +245,10 @@ def track_end(tracker: Tracker, folder: Path, results: Sequence[StepResult]) -> 
     for path in sorted((folder / "renders").glob("*.png"))[:_TRACKED_IMAGES]:
         _track_png(tracker, f"renders/{path.stem}", path)
         _track_png(tracker, f"errors/{path.stem}", folder / "errors" / path.name)
-    for name in (PAGE, TABLE_JSON, TABLE_CSV, RUN_FILE, "point_cloud.ply"):
-        if (folder / name).is_file():
-            tracker.artifact(folder / name)
+    for name in (PAGE, TABLE_JSON, TABLE_CSV, RUN_FILE):
+        tracker.artifact(folder / name)
+    for ply in sorted(folder.glob("*.ply")):  # point_cloud.ply, and the sets of later stages
+        tracker.artifact(ply)
 
 
 def _track_sliders(tracker: Tracker, results: Sequence[StepResult]) -> None:

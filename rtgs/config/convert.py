@@ -36,6 +36,11 @@ def to_run_config(composed: DictConfig, choices: Choices) -> tuple[RunConfig, Ch
             f"{', '.join(config.ablation.methods)}"
         )
     scene = config.scene
+    if config.table.data == "paper" and scene.path.startswith("embedded:"):
+        raise RtgsError(
+            f"config: table.data=paper (make: DATA=...), but scene {scene.name} is a path-traced stand-in, which the "
+            "papers' figures are not for: choose one of ref_real/... or nu_nerf/..., or leave table.data"
+        )
     if not scene.path:
         raise RtgsError(
             "config: scene.path is empty; choose a scene (scene=fox) or give a folder (scene.path=/my/photos)"
@@ -65,8 +70,12 @@ def derive_name(path: str) -> str:
 
 
 def run_name(choices: Choices, seed: int) -> str:
-    """Folder name of a run: ``fox-2dgs-quick``, with the ablation and the seed where they are not the default."""
-    parts = [choices.scene, choices.method, choices.preset]
+    """Folder name of a run: ``fox-2dgs-quick``, with the ablation and the seed where they are not the default.
+
+    Scenes of a dataset are called with it (``ref_real_sedan``): a stand-in may have the same name.
+    """
+    of_dataset = choices.scene_file.endswith(f"/{choices.scene}")
+    parts = [choices.scene_file if of_dataset else choices.scene, choices.method, choices.preset]
     if choices.ablation not in ("", "none"):
         parts.append(choices.ablation)
     if seed:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from rtgs.errors import RtgsError
-from rtgs.pipeline.plan import Plan
+from rtgs.pipeline.plan import Plan, PlannedStep
 from rtgs.pipeline.step import Step
 
 
@@ -44,9 +44,10 @@ class StepOutcome:
 
 @dataclass(frozen=True)
 class SweepOutcomes:
-    """All steps of a sweep by fingerprint."""
+    """All steps of a sweep by fingerprint, and what its merged plan had said of them."""
 
     outcomes: Mapping[str, StepOutcome]
+    planned: Mapping[str, PlannedStep] = field(default_factory=dict)
 
     @staticmethod
     def of(outcomes: Iterable[StepOutcome]) -> SweepOutcomes:
@@ -62,6 +63,10 @@ class SweepOutcomes:
         """Fingerprints of the steps of ``plan`` that this sweep ran."""
         mine = (self.outcomes.get(planned.step.fingerprint) for planned in plan)
         return frozenset(outcome.fingerprint for outcome in mine if outcome is not None and outcome.executed)
+
+    def as_planned(self, plan: Plan) -> Plan:
+        """``plan`` of a job as it was before the sweep ran its steps: what was missing then, and why."""
+        return Plan(tuple(self.planned.get(planned.step.fingerprint, planned) for planned in plan))
 
     def check(self, plan: Plan) -> None:
         """Raise what a step of ``plan`` raised.

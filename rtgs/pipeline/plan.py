@@ -16,6 +16,7 @@ from rtgs.pipeline.store import Store
 
 _REASONS = 3  # differences told for one step
 _VALUE_LENGTH = 40
+_ABSENT = object()
 
 
 @dataclass(frozen=True)
@@ -84,9 +85,12 @@ def make_plan(targets: Sequence[Step], store: Store, remote: RemoteStore | None 
         if remote and remote.manifest(step.name, step.fingerprint) is not None:
             planned.append(PlannedStep(step, False, f"will be fetched from {remote.url}", remote=True))
             continue
-        if step.name not in neighbours:
-            neighbours[step.name] = Neighbours([artifact.manifest for artifact in store.artifacts(step.name)])
-        reason = neighbours[step.name].explain_miss(step)
+        if store.folder(step).is_dir():
+            reason = "its artifact is damaged"
+        else:
+            if step.name not in neighbours:
+                neighbours[step.name] = Neighbours([artifact.manifest for artifact in store.artifacts(step.name)])
+            reason = neighbours[step.name].explain_miss(step)
         if store.partial(step).exists():
             reason += "; resumes from its checkpoint"
         planned.append(PlannedStep(step, False, reason))
@@ -120,8 +124,6 @@ class Neighbours:
             return "never ran here"
         row = self._row(_recipe_of(step))
         nearest = differences(step, self._manifests[int((self._rows != row).sum(axis=1).argmin())])
-        if not nearest:
-            return "its artifact is broken"
         rest = len(nearest) - _REASONS
         return ", ".join(nearest[:_REASONS]) + (f" and {rest} more" if rest > 0 else "")
 
@@ -156,7 +158,7 @@ def _changes(old: dict[str, object], new: dict[str, object]) -> list[str]:
     return [
         f"{key}: {_short(old.get(key, 'absent'))} -> {_short(new.get(key, 'absent'))}"
         for key in sorted(old.keys() | new.keys())
-        if key not in old or key not in new or old[key] != new[key]
+        if repr(old.get(key, _ABSENT)) != repr(new.get(key, _ABSENT))  # 1 and 1.0 are different recipes
     ]
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rtgs.track.protocol import RunInfo, Scalar, Tracker, as_uint8
+from rtgs.track.protocol import RunInfo, Scalar, Tracker, as_uint8, identity
 
 
 class JsonlTracker:
@@ -74,6 +74,11 @@ class JsonlTracking:
 
     def __init__(self, root: Path) -> None:
         self.root = root
+
+    @property
+    def place(self) -> str:
+        """The folder."""
+        return f"jsonl {identity(self.root)}"
 
     @contextmanager
     def run(self, info: RunInfo) -> Iterator[Tracker]:

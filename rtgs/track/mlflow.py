@@ -21,7 +21,7 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from rtgs.errors import RtgsError
-from rtgs.track.protocol import RunInfo, Scalar, Tracker, as_uint8
+from rtgs.track.protocol import RunInfo, Scalar, Tracker, as_uint8, identity
 
 if TYPE_CHECKING:
     from mlflow.tracking import MlflowClient
@@ -105,6 +105,11 @@ class MlflowTracking:
         self.database = self.root / "mlflow.db"
         self.uri = uri or f"sqlite:///{self.database}"
         self._client: MlflowClient | None = None
+
+    @property
+    def place(self) -> str:
+        """The database, or the server."""
+        return f"mlflow {identity(self.database) if self.local else self.uri}"
 
     @property
     def client(self) -> MlflowClient:

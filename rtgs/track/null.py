@@ -38,6 +38,11 @@ class NullTracker:
 class NullTracking:
     """Opens runs that keep nothing."""
 
+    @property
+    def place(self) -> str:
+        """Nowhere."""
+        return "off"
+
     @contextmanager
     def run(self, info: RunInfo) -> Iterator[Tracker]:
         """A run that keeps nothing."""

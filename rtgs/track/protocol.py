@@ -61,6 +61,11 @@ class RunInfo:
 class Tracking(Protocol):
     """Opens runs; one object per process, made by :func:`rtgs.track.open_tracking`."""
 
+    @property
+    def place(self) -> str:
+        """What tells this record from others, found without importing the tracker; another one once it was removed."""
+        ...
+
     def run(self, info: RunInfo) -> AbstractContextManager[Tracker]:
         """A new run. Leaving the context normally ends it as finished, by an exception as failed (killed on Ctrl-C)."""
         ...
@@ -72,6 +77,14 @@ class Tracking(Protocol):
     def finished(self, experiment: str, fingerprint: str) -> bool:
         """Whether a finished run of this fingerprint is recorded in this experiment."""
         ...
+
+
+def identity(path: Path) -> str:
+    """A file or folder that is told from one that takes its place later."""
+    try:
+        return f"{path.absolute()} {path.stat().st_ino}"
+    except OSError:
+        return f"{path.absolute()}, not there"
 
 
 def as_uint8(array: np.ndarray) -> np.ndarray:

@@ -1,9 +1,10 @@
-"""Which source a run came from."""
+"""Which source a run came from, and with what it ran."""
 
 from __future__ import annotations
 
 import subprocess
 from functools import cache
+from importlib import metadata
 from pathlib import Path
 
 
@@ -18,6 +19,13 @@ def git_tags() -> dict[str, str]:
         return {}
     dirty = bool(_git(root, "status", "--porcelain", "--untracked-files=no"))
     return {"mlflow.source.git.commit": commit, "rtgs.source.changed": str(dirty).lower()}
+
+
+@cache
+def installed() -> str:
+    """Every installed distribution, one ``name==version`` a line, as ``pip freeze`` lists those of an index."""
+    found = {(one.metadata["Name"] or "").lower(): one.version for one in metadata.distributions()}
+    return "".join(f"{name}=={found[name]}\n" for name in sorted(found) if name)
 
 
 def _git(root: Path, *arguments: str) -> str:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from dataclasses import dataclass
 from typing import Protocol, TextIO
+
+WORKER = "RTGS_WORKER"
+"""Environment variable of processes whose steps belong to a plan that another process shows."""
 
 
 @dataclass(frozen=True)
@@ -118,9 +122,14 @@ class BarProgress:
 
 
 def progress_for(stream: TextIO | None = None) -> Progress:
-    """A bar where ``stream`` (default: standard error) is a terminal, lines elsewhere."""
+    """A bar where ``stream`` (default: standard error) is a terminal, lines elsewhere.
+
+    Nothing on the terminal of a worker (:data:`WORKER`): the display of the whole plan is there, and two would fight.
+    """
     shown: TextIO = stream or sys.stderr
-    return BarProgress(shown) if shown.isatty() else LineProgress(shown)
+    if not shown.isatty():
+        return LineProgress(shown)
+    return SilentProgress() if os.environ.get(WORKER) else BarProgress(shown)
 
 
 def _clock(seconds: float) -> str:

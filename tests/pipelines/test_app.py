@@ -7,6 +7,7 @@ import json
 import logging
 import math
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -168,6 +169,8 @@ def test_a_mesh_on_request(words, first, root):
     assert (root / "runs" / "meshed" / "mesh.ply").is_file()
     assert "Mesh" in (root / "runs" / "meshed" / "report.html").read_text()
     assert len(list(Store(root / "store").artifacts("train_diffuse"))) == trained
+    assert main([*words, "name=meshed"]) == 0
+    assert not (root / "runs" / "meshed" / "mesh.ply").exists()  # another run of this name: nothing is left of it
 
 
 def test_an_executed_run_is_tracked_with_its_steps(words, first, root):
@@ -185,7 +188,7 @@ def test_an_executed_run_is_tracked_with_its_steps(words, first, root):
     metrics = {key: event["step"] for event in events if event["kind"] == "metrics" for key in event["values"]}
     assert metrics["train/loss"] == 12
     assert metrics["eval/psnr"] is None
-    assert (folder / "artifacts" / "report.html").is_file()
+    assert {"report.html", "point_cloud.ply"} <= {path.name for path in (folder / "artifacts").iterdir()}
 
 
 def test_a_tracked_run_shows_what_tells_it_apart_and_keeps_the_whole_config(words, first, root):
@@ -200,7 +203,21 @@ def test_a_tracked_run_shows_what_tells_it_apart_and_keeps_the_whole_config(word
     assert told["schedule.total"] == "12"
     config = yaml.safe_load((path.parent / "artifacts" / "config.yaml").read_text())
     assert config == yaml.safe_load((root / "runs" / "tiny_room-2dgs-smoke-seed8" / "config.yaml").read_text())
+    assert f"numpy=={np.__version__}" in (path.parent / "artifacts" / "requirements.txt").read_text().splitlines()
     assert config["method"]["loss"]["normal"] == 0.05
+
+
+def test_a_run_that_was_not_tracked_is_recorded_once_a_tracker_is_on(words, first, root):
+    def recorded() -> int:
+        return len(list((root / "tracking" / "rtgs-runs").glob("*_tiny_room-2dgs-smoke_*")))
+
+    assert recorded() == 0
+    for _ in range(2):
+        assert main([*words, "tracking=jsonl"]) == 0
+        assert recorded() == 1
+    shutil.rmtree(root / "tracking")
+    assert main([*words, "tracking=jsonl"]) == 0
+    assert recorded() == 1
 
 
 def test_sweeps_share_steps_and_end_with_a_table(words, first, root, capsys):

@@ -15,6 +15,7 @@ from pipelines.graph import build_graph
 from rtgs.config import compose
 from rtgs.config.locate import choices_of, project_root
 from rtgs.config.sweep import compose_jobs
+from rtgs.errors import RtgsError
 from rtgs.scenes.scene import load_scene
 from tests.scenes.captures import ColmapCapture, save_image
 
@@ -107,6 +108,27 @@ def test_the_tables_run_on_the_papers_data(root, data, table, scenes):
         assert job.choices is not None
         assert job.config.table.data == "paper"
         build_graph(job.config, job.choices)
+
+
+@pytest.mark.parametrize(
+    ("table", "data", "fits"),
+    [("table1", "nu_nerf", "ref_real"), ("table2", "ref_real", "nu_nerf"), ("table3", "x", "")],
+)
+def test_a_table_on_the_data_of_another_is_refused(table, data, fits):
+    """Also where the scenes are named, and nothing else would look at DATA."""
+    words = ["make", "-n", f"reproduce-{table}", f"DATA={data}", "RUN=scene=sedan"]
+    done = subprocess.run(words, cwd=project_root(), capture_output=True, text=True)
+    assert done.returncode == 2
+    assert f"DATA={data}: this table is of stand_in or {fits}" in done.stderr
+
+
+def test_the_papers_figures_are_not_for_stand_ins():
+    with pytest.raises(RtgsError, match=r"scene sedan is a path-traced stand-in.*ref_real"):
+        compose(["experiment=table1", "scene=sedan", "table.data=paper"])
+    names = [
+        compose(["experiment=table1", f"scene={scene}", "method=2dgs"])[0].name for scene in ("sedan", "ref_real/sedan")
+    ]
+    assert names == ["sedan-2dgs-quick", "ref_real_sedan-2dgs-quick"]
 
 
 def test_complete_datasets_are_ready(root, monkeypatch, capsys):

@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import dask
@@ -18,9 +19,11 @@ import toy
 from distributed import Client, LocalCluster
 from toy import ToyParams, executions, graph
 
+from pipelines.sweep import check_arrived
 from rtgs.errors import RtgsError
-from rtgs.pipeline import InlineExecutor, Step, StepUnfinished, Store, SweepOutcomes, make_plan
+from rtgs.pipeline import InlineExecutor, RemoteStore, Step, StepUnfinished, Store, SweepOutcomes, make_plan
 from rtgs.pipeline.engine import DaskExecutor, EngineSettings, WorkerJob, open_client, worker_environment
+from rtgs.pipeline.outcome import StepOutcome
 
 
 def soon(condition: Callable[[], bool], what: str) -> None:
@@ -202,6 +205,25 @@ def _count_faults(params: ToyParams, context) -> None:
 def test_settings_that_cannot_work_are_refused(settings, message):
     with pytest.raises(RtgsError, match=message):
         EngineSettings(**settings)
+
+
+def test_what_workers_keep_to_themselves_is_not_run_again_here(tmp_path):
+    """Their disk is another one, and no store is shared: told, instead of every job doing all the work once more."""
+    (target,) = graph(tmp_path, (0.1,))
+    theirs, here = Store(tmp_path / "theirs"), Store(tmp_path / "here")
+    InlineExecutor(theirs).execute(make_plan([target], theirs))
+    outcome = StepOutcome("train", target.fingerprint, theirs.folder(target), 1.0, True)
+    outcomes = SweepOutcomes({target.fingerprint: outcome})
+    with pytest.raises(RtgsError, match=r"train \w+ is finished in .*theirs.* not in .*here here: .*paths\.remote"):
+        check_arrived([target], outcomes, here, None, patience=0.0)
+    check_arrived([target], outcomes, theirs, None, patience=0.0)
+    remote = RemoteStore(str(tmp_path / "shared"))
+    artifact = theirs.find(target)
+    assert artifact is not None
+    remote.push(artifact)
+    check_arrived([target], outcomes, here, remote, patience=0.0)
+    failed = SweepOutcomes({target.fingerprint: replace(outcome, folder=None, problem="no")})
+    check_arrived([target], failed, here, None, patience=0.0)
 
 
 def test_cores_are_shared_among_local_workers():

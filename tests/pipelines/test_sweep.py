@@ -93,6 +93,10 @@ def test_a_sweep_is_one_plan_and_every_job_has_its_results(capture, tmp_path, ca
     (group,) = (path for path in (tmp_path / "tracking" / "rtgs-runs").glob("sweep_*"))
     assert [start.get("parent") for start in starts if start["name"].startswith("row-")] == [group.name] * 4
     assert sorted(path.suffix for path in (group / "artifacts").iterdir()) == [".csv", ".html", ".md", ".tex"]
+    for path in (tmp_path / "tracking" / "rtgs-runs").glob("*row-*/events.jsonl"):
+        events = [json.loads(line) for line in path.read_text().splitlines()]
+        (plan,) = (event["rows"] for event in events if event["kind"] == "table" and event["name"] == "plan")
+        assert {(row["state"], row["why"]) for row in plan} == {("to run", "never ran here")}  # before the sweep ran it
     threads = {artifact.manifest.machine["threads"] for artifact in store.artifacts("train_diffuse")}
     assert threads == {1}
 
@@ -127,6 +131,7 @@ def test_a_failing_job_leaves_the_others_alone_and_says_why(capture, tmp_path, c
     assert main([*words, "schedule.densify_every=0,5"]) == 1
     captured = capsys.readouterr()
     assert "1 of 2 jobs failed" in captured.out
+    assert "job 0 (" in captured.out
     assert "schedule.densify_every is 0" in captured.out
     assert (tmp_path / "runs" / "row-2dgs-smoke" / "report.html").is_file()
 
@@ -143,11 +148,11 @@ def test_a_stock_launcher_with_its_own_processes_ends_the_same_way(capture, tmp_
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="no hydra-joblib-launcher here (extra dev)")
     words = ["run", "--multirun", f"scene={capture}", *(word for word in QUICK if not word.startswith("hydra"))]
     words += ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "threads=1", "tracking=off", "table.name=mine"]
-    assert main([*words, "schedule.densify_every=0,5"]) == 1
+    assert main([*words, "schedule.densify_every=0,5,-1"]) == 1
     captured = capsys.readouterr()
-    assert "1 of 2 jobs failed" in captured.out
-    assert "did not finish (train_diffuse" in captured.out
-    assert "schedule.densify_every is 0" in captured.err  # the job's own error
+    assert "2 of 3 jobs failed" in captured.out
+    for value in (0, -1):  # each job's own error; the launcher brings only the first
+        assert f"schedule.densify_every is {value}" in captured.out
     assert (tmp_path / "runs" / "row-2dgs-smoke" / "report.html").is_file()
     assert "2dgs" in (tmp_path / "tables" / "mine-smoke" / "table.md").read_text()
 
@@ -162,5 +167,7 @@ def test_a_stock_launcher_with_its_own_processes_ends_the_same_way(capture, tmp_
 )
 def test_mistakes_stop_before_any_work(capture, tmp_path, override, expected, capsys):
     assert main(["run", "--multirun", f"scene={capture}", *QUICK, override]) == 1
-    assert expected in capsys.readouterr().err
+    captured = capsys.readouterr()
+    assert expected in captured.err
+    assert "jobs failed" not in captured.out  # none of them was started
     assert not list(Store(tmp_path / "store").artifacts("train_diffuse"))

@@ -8,8 +8,9 @@ from types import SimpleNamespace
 
 import pytest
 
+from rtgs.pipeline.engine import worker_environment
 from rtgs.train import progress
-from rtgs.train.progress import BarProgress, LineProgress, StepReport, progress_for
+from rtgs.train.progress import BarProgress, LineProgress, SilentProgress, StepReport, progress_for
 
 
 class Terminal(io.StringIO):
@@ -17,8 +18,12 @@ class Terminal(io.StringIO):
         return True
 
 
-def test_a_terminal_gets_a_bar_and_a_file_gets_lines():
+def test_a_terminal_gets_a_bar_and_a_file_gets_lines(monkeypatch):
     assert isinstance(progress_for(Terminal()), BarProgress)
+    assert isinstance(progress_for(io.StringIO()), LineProgress)
+    for key, value in worker_environment(1).items():  # on a terminal, the plan's own display is the only one
+        monkeypatch.setenv(key, value)
+    assert isinstance(progress_for(Terminal()), SilentProgress)
     assert isinstance(progress_for(io.StringIO()), LineProgress)
 
 
