@@ -1,10 +1,21 @@
-"""A store that machines share: the layout of the local one behind any URL of fsspec (s3://, sftp://, a folder)."""
+"""A store that machines share, behind any URL of fsspec (s3://, sftp://, a folder).
+
+Layout under the URL::
+
+    <step>/<fp[:2]>/<fp>/<random>/files...   what one sender sent
+    <step>/<fp[:2]>/<fp>/manifest.json       the manifest, and under ``sent`` whose files are the artifact
+
+Written last, the manifest makes the artifact. Two senders of one recipe may have made different bytes: neither touches
+the files of the other, and a manifest names those it was written with. No lock and no conditional write is needed,
+which not every store has.
+"""
 
 from __future__ import annotations
 
 import json
 import logging
 import re
+import secrets
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -16,6 +27,7 @@ from rtgs.pipeline.manifest import Manifest
 from rtgs.pipeline.store import Artifact, Store
 
 log = logging.getLogger("rtgs.pipeline")
+_SENT = re.compile(r"[0-9a-f]*")
 _PLACE = re.compile(r"([a-z][a-z0-9_]*)/[0-9a-f]{2}/([0-9a-f]{64})/" + re.escape(manifests.NAME))
 
 
@@ -24,7 +36,7 @@ class RemoteStoreError(RtgsError):
 
 
 class RemoteStore:
-    """Finished artifacts behind a URL. Files go up first and the manifest last, so a half-sent artifact does not exist.
+    """Finished artifacts behind a URL; one that is half sent does not exist.
 
     Credentials and endpoints are the file system's own affair (``AWS_ACCESS_KEY_ID``, ``AWS_ENDPOINT_URL``, ...): none
     is ever part of a config or a manifest.
@@ -51,19 +63,28 @@ class RemoteStore:
 
     def manifest(self, name: str, fingerprint: str) -> Manifest | None:
         """The manifest of a finished artifact there; None when there is none."""
+        found = self._read(name, fingerprint)
+        return None if found is None else found[0]
+
+    def _read(self, name: str, fingerprint: str) -> tuple[Manifest, str] | None:
+        """The manifest, and the folder of the files it was written with."""
+        folder = self._folder(name, fingerprint)
         try:
-            text = self._fs.cat_file(f"{self._folder(name, fingerprint)}/{manifests.NAME}")
+            text = self._fs.cat_file(f"{folder}/{manifests.NAME}")
         except FileNotFoundError:
             return None
         except Exception as error:
             raise self._unreachable(error) from error
-        found = Manifest.parse(json.loads(text))
-        if found is None or (found.step, found.fingerprint) != (name, fingerprint):
+        content = json.loads(text)
+        sent = content.pop("sent", "") if isinstance(content, dict) else None
+        found = Manifest.parse(content)
+        wanted = found is not None and (found.step, found.fingerprint) == (name, fingerprint)
+        if found is None or not wanted or not isinstance(sent, str) or not _SENT.fullmatch(sent):
             raise RemoteStoreError(
                 f"{self.url}: the manifest of {name} {fingerprint[:12]} is not one of that artifact; delete the folder "
-                f"{self._folder(name, fingerprint)} there"
+                f"{folder} there"
             )
-        return found
+        return found, f"{folder}/{sent}".rstrip("/")
 
     def artifacts(self, name: str | None = None) -> Iterator[tuple[str, str]]:
         """(step, fingerprint) of every finished artifact there, or those of one step name."""
@@ -86,12 +107,15 @@ class RemoteStore:
         manifest, folder = artifact.manifest, self._folder(artifact.manifest.step, artifact.manifest.fingerprint)
         if self.manifest(manifest.step, manifest.fingerprint) is not None:
             return False
+        sent = secrets.token_hex(6)
+        content = json.loads((artifact.folder / manifests.NAME).read_text(encoding="utf-8")) | {"sent": sent}
         try:
+            self._fs.makedirs(folder, exist_ok=True)
             for file in manifest.files:
-                target = f"{folder}/{file}"
+                target = f"{folder}/{sent}/{file}"
                 self._fs.makedirs(target.rpartition("/")[0], exist_ok=True)
                 self._fs.put_file(str(artifact.folder / file), target)
-            self._fs.pipe_file(f"{folder}/{manifests.NAME}", (artifact.folder / manifests.NAME).read_bytes())
+            self._fs.pipe_file(f"{folder}/{manifests.NAME}", json.dumps(content).encode())
         except Exception as error:
             raise self._unreachable(error) from error
         return True
@@ -104,10 +128,11 @@ class RemoteStore:
         Raises:
             RemoteStoreError: a file is missing or differs from its digest; nothing is taken over.
         """
-        manifest = self.manifest(name, fingerprint)
-        if manifest is None:
+        found = self._read(name, fingerprint)
+        if found is None:
             return None
-        source, attempt = self._folder(name, fingerprint), store.new_attempt(name, fingerprint)
+        manifest, source = found
+        attempt = store.new_attempt(name, fingerprint)
         try:
             for file, record in manifest.files.items():
                 target = attempt / _inside(file, self.url)

@@ -11,7 +11,7 @@ import pytest
 from toy import executions, graph
 
 from rtgs.pipeline import InlineExecutor, RemoteStore, RemoteStoreError, Store, make_plan
-from rtgs.pipeline.manifest import NAME
+from rtgs.pipeline.manifest import NAME, Manifest, describe
 
 BUCKET = "artifacts"
 
@@ -74,6 +74,35 @@ def test_pushing_twice_sends_once(tmp_path, url):
     assert [remote.push(artifact) for artifact in store.artifacts()] == [False] * 5
 
 
+def test_two_senders_of_one_recipe_never_mix_their_files(tmp_path, url):
+    """The second finds no manifest, because the first has not got there yet; their bytes differ."""
+    remote, steps = RemoteStore(url), graph(tmp_path)
+    one, two = (Store(tmp_path / name / "store") for name in ("one", "two"))
+    for store in (one, two):
+        InlineExecutor(store).execute(make_plan(steps, store))
+    step = steps[0]
+    (two.folder(step) / "result.txt").write_text("other bytes")
+    manifest = Manifest.read(two.folder(step))
+    assert manifest is not None
+    describe(step, two.folder(step), 2.0, manifest.created).write(two.folder(step))
+
+    class Late(RemoteStore):
+        """Has looked before the other's manifest came, and is overtaken while it sends."""
+
+        def manifest(self, name, fingerprint):
+            return None
+
+    first, second = one.find(step), two.find(step)
+    assert first is not None
+    assert second is not None
+    for artifact in (first, second):
+        assert Late(url).push(artifact)
+        fetched = remote.fetch(step.name, step.fingerprint, Store(tmp_path / artifact.folder.parts[-5] / "again"))
+        assert fetched is not None
+        assert fetched.manifest == artifact.manifest
+        assert (fetched.folder / "result.txt").read_bytes() == (artifact.folder / "result.txt").read_bytes()
+
+
 def test_an_artifact_without_its_manifest_does_not_exist(tmp_path, url):
     remote = RemoteStore(url)
     store = run(tmp_path, "one", remote)
@@ -89,7 +118,8 @@ def test_damage_there_is_refused_and_leaves_nothing_here(tmp_path, url):
     remote = RemoteStore(url)
     run(tmp_path, "one", remote)
     step = graph(tmp_path)[0]
-    remote._fs.pipe_file(f"{remote._folder(step.name, step.fingerprint)}/result.txt", b"1.51.5 0.9")
+    (result,) = remote._fs.glob(f"{remote._folder(step.name, step.fingerprint)}/*/result.txt")
+    remote._fs.pipe_file(result, b"1.51.5 0.9")
     store = Store(tmp_path / "two" / "store")
     with pytest.raises(RemoteStoreError, match="not what its manifest says"):
         remote.fetch(step.name, step.fingerprint, store)
