@@ -122,14 +122,18 @@ class ObjectMesh:
         """
         bounds = self.bounds
         if self.flat:
-            seen = self._seen_through(cameras, points.detach().double().numpy())
+            places = points.detach().double().numpy()
+            seen = places[self._seen_through(cameras, places)]
             behind = np.quantile(seen, [_BOX_POINTS, 1 - _BOX_POINTS], axis=0) if len(seen) else self._shadow(cameras)
             bounds = np.stack([np.minimum(bounds[0], behind[0]), np.maximum(bounds[1], behind[1])])
         margin = BOX_MARGIN * np.maximum(bounds[1] - bounds[0], self.voxel)
         return torch.from_numpy(np.stack([bounds[0] - margin, bounds[1] + margin])).float()
 
+    def seen_through(self, cameras: Sequence[Camera], points: Tensor) -> Tensor:
+        """(N,) bool: points (N, 3) that at least one camera has in its picture, behind the first surface."""
+        return torch.from_numpy(self._seen_through(cameras, points.detach().double().numpy()))
+
     def _seen_through(self, cameras: Sequence[Camera], points: np.ndarray) -> np.ndarray:
-        """The points that lie behind the pane, and in the picture, for at least one camera."""
         through = np.zeros(len(points), bool)
         for camera in cameras:
             pixels, depth = camera.project(torch.from_numpy(points))
@@ -143,7 +147,7 @@ class ObjectMesh:
             distance = self.rays.intersect(origin, along).distance[:, 0]  # in lengths of the way to the point
             gap = self.merge_distance / np.linalg.norm(along, axis=1)
             through[candidates[distance < 1 - gap]] = True
-        return points[through]
+        return through
 
     def _shadow(self, cameras: Sequence[Camera]) -> np.ndarray:
         """(2, 3) box of the pane pushed away from the cameras by its own size."""

@@ -160,23 +160,26 @@ class GlassStage(ReflectiveMethod):
         return found
 
     def _add_transmittance(self, mesh: ObjectMesh, kept: Tensor) -> StepEvent:
-        settings = self.settings.transmittance
+        settings, cameras = self.settings.transmittance, [view.camera for view in self._views]
+        where = "behind the pane" if mesh.flat else "inside the object"
         inside = torch.zeros(len(self.base), dtype=torch.bool)
         if settings.split:
             assert isinstance(self.base.surfels, Surfels)
-            inside = rows_inside(self.base.surfels, mesh, settings.split_margin * mesh.voxel)
+            inside = rows_inside(self.base.surfels, mesh, settings.split_margin * mesh.voxel, cameras)
         found = int(inside.sum())
         if settings.init.min_points <= found < len(inside):
-            surfels, detail = take_out(self.base, inside, kept), f"{found} base surfels inside the object"
-            if both := int((inside & kept).sum()):
+            kept = torch.ones_like(kept) if mesh.flat else kept  # what is behind a pane is seen beside it, too
+            surfels, detail = take_out(self.base, inside, kept), f"{found} base surfels {where}"
+            if mesh.flat:
+                detail = f"copies of {detail}"
+            elif both := int((inside & kept).sum()):
                 detail += f", {both} of them seen bare too: they also stay in the base set"
             self._from_base = True
             self._base_tree.clear()
         else:
-            cameras = [view.camera for view in self._views]
             box = initial_box(settings, mesh, cameras, self._points)
             surfels = random_surfels(settings, box, self.generator)
-            why = f", for only {found} base surfels are inside the object" if settings.split else ""
+            why = f", for only {found} base surfels are {where}" if settings.split else ""
             detail = f"{len(surfels)} random surfels in the box of the {settings.box}{why}"
         self.transmittance = self._transmittance_set(surfels)
         return StepEvent("begin", "transmittance", detail)

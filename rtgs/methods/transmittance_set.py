@@ -1,12 +1,15 @@
-"""Where the transmittance set comes from: base surfels inside the object, or random ones in a box (methods.md 6.2)."""
+"""Where the transmittance set comes from: base surfels inside the object or behind the pane, or random ones in a box
+(methods.md 6.2)."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
+from rtgs.cameras import Camera
 from rtgs.gaussians.density import RowPlan, apply_plan, select_rows
 from rtgs.gaussians.initialize import points_box
 from rtgs.gaussians.materials import MaterialSurfels, without_materials
@@ -17,11 +20,14 @@ from rtgs.methods.traced_set import stratified_surfels
 from rtgs.train.settings import TransmittanceSettings
 
 
-def rows_inside(surfels: Surfels, mesh: ObjectMesh, margin: float) -> Tensor:
-    """(N,) bool: the centre lies in the object, or within ``margin`` (world units) of it along an axis."""
+def rows_inside(surfels: Surfels, mesh: ObjectMesh, margin: float, cameras: Sequence[Camera]) -> Tensor:
+    """(N,) bool: the centre lies in the object, or within ``margin`` (world units) of it along an axis; of a pane:
+    behind it for one of the ``cameras``, for straight rays through a pane meet the transmittance set alone."""
     means = surfels.means.detach()
+    if mesh.flat:
+        return mesh.seen_through(cameras, means)
     inside = mesh.inside(means)
-    if margin > 0 and not mesh.flat:
+    if margin > 0:
         for axis in range(3):
             for side in (-margin, margin):
                 shift = torch.zeros(3)

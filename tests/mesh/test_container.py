@@ -166,6 +166,8 @@ def test_transmittance_box() -> None:
     assert low[1] > -0.3  # behind the pane
     assert high[1] > 3.5  # as far as the scene goes
     assert high[0] > 1.2  # the cone widens
+    behind = glass.seen_through(cameras, torch.tensor([[0.0, 2.0, 0.0], [0.0, -1.0, 0.0], [5.0, 0.5, 0.0]]))
+    assert behind.tolist() == [True, False, False]
     low, high = glass.transmittance_box(cameras, torch.zeros(0, 3))
     assert high[1] > 1.0  # no point: as deep as it is large
     assert glass.transmittance_box([], torch.zeros(0, 3)).shape == (2, 3)
