@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import os
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("rtgs.pipeline")
 ENGINES = ("local", "ssh", "slurm", "address")
+WORKER = "RTGS_WORKER"  # what rtgs.train.progress asks for
 
 
 @dataclass(frozen=True)
@@ -162,13 +163,15 @@ def open_client(settings: EngineSettings) -> Iterator[Client]:
     except ImportError as error:
         raise RtgsError("hydra/launcher=rtgs_dask needs Dask: pip install 'rtgs[cluster]'") from error
     logging.getLogger("distributed").setLevel(logging.WARNING)  # importing it sets INFO, over what conf/hydra says
+    at_start = {key: value for key, value in worker_environment(settings.worker_threads).items() if key != WORKER}
     limits = {
         "distributed.scheduler.allowed-failures": settings.retries,
         "distributed.worker.memory.terminate": False,
         # Read by a process as it starts, so not with `env`. Dask's own has the allocator give everything back at once.
-        "distributed.nanny.pre-spawn-environ": dict(worker_environment(settings.worker_threads)),
+        "distributed.nanny.pre-spawn-environ": dict(at_start),
     }
     with ExitStack() as stack:
+        stack.enter_context(_kept_environment(at_start))
         stack.enter_context(dask_config.set(limits))
         try:
             cluster = settings.address if settings.kind == "address" else stack.enter_context(_cluster(settings))
@@ -177,6 +180,19 @@ def open_client(settings: EngineSettings) -> Iterator[Client]:
             raise RtgsError(f"the {settings.kind} cluster did not start: {error}") from error
         log.info("%d workers of %d threads: %s", settings.workers, settings.worker_threads, settings.kind)
         yield client
+
+
+@contextmanager
+def _kept_environment(names: Iterable[str]) -> Iterator[None]:
+    """Dask's nannies live in this process and set what their workers are to start with here, for good."""
+    before = {name: os.environ.get(name) for name in names}
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name, None)
+            if value is not None:
+                os.environ[name] = value
 
 
 def _cluster(settings: EngineSettings) -> Any:
@@ -235,7 +251,7 @@ def worker_environment(threads: int) -> Mapping[str, str]:
     """
     names = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
     kept = {"MALLOC_TRIM_THRESHOLD_": str(256 << 20), "MALLOC_MMAP_THRESHOLD_": str(32 << 20)}  # bytes; glibc's largest
-    return {**dict.fromkeys(names, str(threads)), "OMP_WAIT_POLICY": "passive", "RTGS_WORKER": "1", **kept}
+    return {**dict.fromkeys(names, str(threads)), "OMP_WAIT_POLICY": "passive", WORKER: "1", **kept}
 
 
 def _cores() -> int:

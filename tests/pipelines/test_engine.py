@@ -22,7 +22,7 @@ from toy import ToyParams, executions, graph
 from pipelines.sweep import check_arrived
 from rtgs.errors import RtgsError
 from rtgs.pipeline import InlineExecutor, RemoteStore, Step, StepUnfinished, Store, SweepOutcomes, make_plan
-from rtgs.pipeline.engine import DaskExecutor, EngineSettings, WorkerJob, open_client, worker_environment
+from rtgs.pipeline.engine import WORKER, DaskExecutor, EngineSettings, WorkerJob, open_client, worker_environment
 from rtgs.pipeline.outcome import StepOutcome
 
 
@@ -142,8 +142,12 @@ def test_a_step_that_kills_its_workers_is_given_up(tmp_path):
     deadly = Step("deadly", 1, ToyParams(1.0, str(tmp_path)), _die)
     os.environ["PYTHONPATH"] = os.pathsep.join([str(Path(toy.__file__).parent), *sys.path])
     store = Store(tmp_path / "store")
+    names = worker_environment(1)
+    before = {name: os.environ.get(name) for name in names}
     with open_client(EngineSettings(workers=1, threads=1, retries=0)) as client:
+        assert WORKER not in os.environ, "this process shows the plan; only its workers are silent"
         outcomes = DaskExecutor(client, WorkerJob(str(store.root), 1)).attempt(make_plan([deadly], store))
+    assert {name: os.environ.get(name) for name in names} == before, "Dask sets a worker's environment here"
     assert [failure.step for failure in outcomes.failures] == ["deadly"]
     assert "KilledWorker" in outcomes.failures[0].problem
 
