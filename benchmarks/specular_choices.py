@@ -146,13 +146,13 @@ def compose_choice(options: argparse.Namespace, choice: Sequence[str]) -> RunCon
     from benchmarks.training_runs import schedule_overrides
     from rtgs.config.compose import compose
 
-    words = ["preset=quick"]
+    words = [f"preset={options.preset}"]
     if options.scene == MIRROR_BALL:  # small enough for seconds: as many surfels as its pixels can tell apart
         words += ["method.density.max_surfels=6000", "method.reflection.cells=9"]
     else:
         words += [f"scene={options.scene}", f"scene.long_side={options.long_side}"]
     if options.steps:
-        words += schedule_overrides(options.steps, "quick")
+        words += schedule_overrides(options.steps, options.preset)
     return compose([*words, *options.set, *choice])[0]
 
 
@@ -280,7 +280,8 @@ def main() -> None:
         "--also", nargs="*", default=[], metavar="WORDS", help="more choices: config words in one string"
     )
     parser.add_argument("--set", nargs="*", default=[], help="config words for every choice")
-    parser.add_argument("--steps", type=int, help="shorten the schedule of preset quick")
+    parser.add_argument("--preset", default="quick")
+    parser.add_argument("--steps", type=int, help="shorten the schedule of the preset")
     parser.add_argument("--long-side", type=int, default=256)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--root", type=Path, default=Path("outputs/specular_choices"), help="first stages, pictures")

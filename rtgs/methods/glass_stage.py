@@ -189,7 +189,7 @@ class GlassStage(ReflectiveMethod):
         return ReflectionSet(
             "transmittance",
             surfels,
-            optimizer=self.settings.optimizer,
+            optimizer=self.settings.optimizer.learning_faster(settings.rate_gain),
             density=settings.density,
             means_lr_steps=self.through.own.means_lr_steps,
             extent=self.extent,

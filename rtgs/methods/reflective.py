@@ -122,7 +122,7 @@ class ReflectiveMethod(SurfelMethod):
         return ReflectionSet(
             "reflection",
             surfels,
-            optimizer=self.settings.optimizer,
+            optimizer=self.settings.optimizer.learning_faster(self.settings.reflection.rate_gain),
             density=self.settings.reflection.density,
             means_lr_steps=self.schedule.means_lr_steps,
             extent=self.extent,

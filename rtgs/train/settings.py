@@ -5,7 +5,7 @@ Steps count from 0. A stage boundary "from" is the first step at which something
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from rtgs.optics.settings import OpticsSettings
 from rtgs.train.refuse import refuse_bad_numbers, refuse_unless
@@ -42,6 +42,11 @@ class OptimizerSettings:
 
     def __post_init__(self) -> None:
         refuse_bad_numbers(self, "method.optimizer")
+
+    def learning_faster(self, gain: float) -> OptimizerSettings:
+        """The rates of colours and scales times ``gain``; the others stay."""
+        names = ("sh_dc", "sh_rest", "log_scales")
+        return replace(self, **{name: gain * getattr(self, name) for name in names})
 
 
 @dataclass(frozen=True)
@@ -205,7 +210,7 @@ class ReflectionSettings:
 
     Boundaries are shares of the run, so that they keep their sense when it shrinks; intervals are steps, because what
     they wait for (views seen, recovery from a reset) takes as many steps in a short run as in a long one. Learning
-    rates are those of ``method.optimizer``, the same for both sets.
+    rates are those of ``method.optimizer``, the same for both sets unless ``rate_gain`` says otherwise.
     """
 
     start: float = 0.05  # share of the run: 3,000 of 60,000
@@ -227,6 +232,8 @@ class ReflectionSettings:
     offset: float = 1e-4  # of the mirror ray's start, times the extent (methods.md 6.3; EnvGS 0)
     smallest_alpha: float = 1e-2  # pixels with less coverage have no surface to reflect at
     rebuild_every: int = 100  # steps between new trees; in between the tree is refitted (kernels.md)
+    # Times the rates of colours and scales: the set starts from noise when the base set is half done.
+    rate_gain: float = 1.0
     transmittance_cutoff: float = 1e-4
     alpha_cutoff: float = 1 / 255
     direction_gradient: str = "full"  # register row 24; "last_sh": what EnvGS's public tracer returns
@@ -320,6 +327,7 @@ class TransmittanceSettings:
     opacity_reset_every: int = 6_000  # 0 = never; only while densifying
     sh_every: int = 1_000  # one degree more each; a set taken from the base keeps its degrees
     rebuild_every: int = 100  # steps between new trees
+    rate_gain: float = 1.0  # as the reflection set's
     transmittance_cutoff: float = 1e-4
     alpha_cutoff: float = 1 / 255
     interface: InterfaceSettings = field(default_factory=InterfaceSettings)

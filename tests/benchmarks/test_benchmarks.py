@@ -15,6 +15,7 @@ import pytest
 
 from benchmarks import (
     captures,
+    density_cap,
     gaussians,
     losses,
     masks,
@@ -29,6 +30,7 @@ from benchmarks import (
     trace_scene,
     trace_training,
     train_step,
+    training_choices,
     training_parts,
     training_runs,
 )
@@ -304,3 +306,23 @@ def test_masks_times_a_network(run, part: str, tmp_path: Path) -> None:
     figures = run(masks, "--part", part, "--photos", "1", "--one", str(tmp_path))
     assert set(figures) == {"seconds", "cpu_seconds", "load_seconds", "memory_mb", "imports_mb"}
     assert all(value > 0 for value in figures.values())
+
+
+def test_training_choices_judges_without_test_views(run) -> None:
+    words = ["--scenes", "ball_statue", "--preset", "smoke", "--set", "scene.long_side=48 schedule.total=40"]
+    record = run(training_choices, *words, "--also", "method.loss.dssim=0")
+    as_it_is, other = record["scores"]
+    assert other["trial"]["words"].endswith("method.loss.dssim=0")
+    assert as_it_is["psnr"] != other["psnr"]
+    assert 5 < as_it_is["psnr"] < 40
+    assert as_it_is["gaussians"] > 0
+    assert as_it_is["cpu_seconds"] > 0
+
+
+def test_training_choices_holds_out_training_views() -> None:
+    scene = mirror_scene(16, 16, 12).scene
+    kept = density_cap.judged_in_training(scene)
+    judged, trained = {view.name for view in kept.test}, {view.name for view in kept.train}
+    assert judged
+    assert not judged & trained
+    assert judged | trained == {view.name for view in scene.train}

@@ -12,7 +12,8 @@ from rtgs.methods.reflective import ReflectiveMethod
 
 
 def options(**changes: object) -> Namespace:
-    return Namespace(**({"scene": MIRROR_BALL, "steps": None, "long_side": 24, "set": [], "root": Path()} | changes))
+    given = {"scene": MIRROR_BALL, "preset": "quick", "steps": None, "long_side": 24, "set": [], "root": Path()}
+    return Namespace(**(given | changes))
 
 
 def test_views_to_judge_are_neither_trained_nor_tested():

@@ -105,6 +105,15 @@ def test_the_reflection_set_can_start_in_a_colour_of_the_training_images():
     torch.testing.assert_close(found, expected.expand_as(found), atol=1e-5, rtol=0)
 
 
+def test_a_set_that_starts_late_can_learn_faster_than_the_base():
+    method, _ = in_second_stage(recipe(rate_gain=3.0))
+    assert method.reflection is not None
+    base, reflection = (part.optimizer.learning_rates(0) for part in (method.base, method.reflection))
+    faster = {name for name in reflection if abs(reflection[name] - 3 * base[name]) < 1e-12}
+    assert faster == {"sh_dc", "sh_rest", "log_scales"}
+    assert all(reflection[name] == base[name] for name in reflection.keys() - faster)
+
+
 def test_rtgs_starts_as_bright_as_the_mirror_ray_from_every_angle():
     """w_r near EnvGS's 1: a start that is darker than what it replaces teaches k_s to fall."""
     config, _ = compose(["scene=demo", "method=rtgs", "preset=quick"])
