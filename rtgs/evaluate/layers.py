@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from rtgs.evaluate.metrics import psnr
+from rtgs.evaluate.surface import SurfaceTruth
 from rtgs.scenes.truth import srgb_from_linear
 
 LAYERS = {"reflection": "reflected", "transmission": "transmitted"}  # of a render, by the name of their truth
@@ -24,7 +25,7 @@ LAYER_METRICS = (
 )
 
 
-class LayerTruth(Protocol):
+class LayerTruth(SurfaceTruth, Protocol):
     """What the figures need of a view's truth; :class:`rtgs.scenes.truth.ViewTruth` has it."""
 
     @property
@@ -33,10 +34,6 @@ class LayerTruth(Protocol):
     def reflected(self) -> Tensor: ...  # (3, H, W) linear light x exposure
     @property
     def transmitted(self) -> Tensor: ...  # likewise
-    @property
-    def depth(self) -> Tensor: ...  # (H, W) z-depth of the first surface, 0 where nothing
-    @property
-    def normal(self) -> Tensor: ...  # (3, H, W) unit, camera frame
 
 
 class LayeredRender(Protocol):

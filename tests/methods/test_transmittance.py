@@ -69,6 +69,14 @@ def test_the_base_set_is_split_by_the_mesh(made: GlassScene):
     assert float(method.interface.surfels.opacity_logits.detach().sigmoid().min()) == pytest.approx(0.95)
 
 
+def test_the_set_behind_glass_can_learn_faster_than_the_base(made: GlassScene):
+    recipe = glass_recipe()
+    method = begun(replace(recipe, transmittance=replace(recipe.transmittance, rate_gain=3.0)), made)
+    assert method.transmittance is not None
+    base, behind = (part.optimizer.learning_rates(0) for part in (method.base, method.transmittance))
+    assert {name for name in behind if behind[name] == 3 * base[name]} == {"sh_dc", "sh_rest", "log_scales"}
+
+
 def test_glass_may_have_a_bound_of_its_own(made: GlassScene):
     """``transmittance.max_gain`` changes the reflection in the object's pixels and nowhere else."""
     recipe = glass_recipe()
