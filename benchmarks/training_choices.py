@@ -13,10 +13,13 @@ import argparse
 import json
 import subprocess
 import sys
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING
 
-from benchmarks.density_cap import judged_in_training
 from benchmarks.machine import machine
+
+if TYPE_CHECKING:
+    from rtgs.scenes.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -37,7 +40,6 @@ class TrialScore:
     trial: Trial
     psnr: float
     ssim: float
-    psnr_specular: float | None  # on mirror, gloss and glass, where that is known
     gaussians: int
     cpu_seconds: float
     peak_mb: float
@@ -45,13 +47,20 @@ class TrialScore:
     def row(self) -> str:
         """A line of the table."""
         trial = self.trial
-        specular = "-" if self.psnr_specular is None else f"{self.psnr_specular:.2f}"
         cells = (trial.scene, trial.method, trial.words or "as it is", str(trial.seed))
-        cells += (f"{self.psnr:.2f}", f"{self.ssim:.3f}", specular, f"{self.gaussians:,}")
+        cells += (f"{self.psnr:.2f}", f"{self.ssim:.3f}", f"{self.gaussians:,}")
         return f"| {' | '.join(cells)} | {self.cpu_seconds:.0f} | {self.peak_mb:.0f} |"
 
 
-HEADER = "| scene | method | choice | seed | PSNR | SSIM | on specular | Gaussians | CPU s | peak MB |"
+def judged_in_training(scene: Scene) -> Scene:
+    """The scene with held-out training views in the place of its test views."""
+    from benchmarks.specular_choices import held_out
+
+    kept, judged = held_out(scene)
+    return replace(kept, test=judged)
+
+
+HEADER = "| scene | method | choice | seed | PSNR | SSIM | Gaussians | CPU s | peak MB |"
 
 
 def measure(trial: Trial) -> TrialScore:
@@ -67,8 +76,7 @@ def measure(trial: Trial) -> TrialScore:
     assert quality["psnr"] is not None
     assert quality["ssim"] is not None
     count = sum(len(part) for part in run.method.sets)
-    specular = quality["psnr_specular"]
-    return TrialScore(trial, quality["psnr"], quality["ssim"], specular, count, run.cpu_seconds, run.peak_memory_mb)
+    return TrialScore(trial, quality["psnr"], quality["ssim"], count, run.cpu_seconds, run.peak_memory_mb)
 
 
 def in_own_process(trial: Trial) -> TrialScore:

@@ -15,7 +15,6 @@ import pytest
 
 from benchmarks import (
     captures,
-    density_cap,
     gaussians,
     losses,
     masks,
@@ -321,7 +320,7 @@ def test_training_choices_judges_without_test_views(run) -> None:
 
 def test_training_choices_holds_out_training_views() -> None:
     scene = mirror_scene(16, 16, 12).scene
-    kept = density_cap.judged_in_training(scene)
+    kept = training_choices.judged_in_training(scene)
     judged, trained = {view.name for view in kept.test}, {view.name for view in kept.train}
     assert judged
     assert not judged & trained
