@@ -47,11 +47,11 @@ from rtgs.train.losses import surface_depth
 from rtgs.train.perceptual import PerceptualLoss
 from rtgs.train.schedule import (
     base_densify_due,
+    base_reset_due,
     densify_ahead,
     densify_due,
     loss_start,
     opacities_held,
-    opacity_reset_due,
     propagation_due,
     reflection_plan,
     reflection_reset_due,
@@ -309,7 +309,7 @@ class ReflectiveMethod(SurfelMethod):
         """Opacity resets of both sets, k_s resets, normal propagation."""
         settings = self.settings
         events = []
-        if self.base.density.resets_opacity and opacity_reset_due(self.plan.base, following):
+        if self.base.density.resets_opacity and base_reset_due(self.plan, following):
             events.append(self.reset_opacity(self.base, settings.density.reset_opacity))
             if self.reflection is not None and settings.reflection.specular_reset:
                 reset_specular(self.base, settings.materials.specular)

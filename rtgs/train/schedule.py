@@ -98,14 +98,24 @@ def reflection_plan(settings: ReflectionSettings, schedule: ScheduleSettings) ->
 def propagation_due(plan: ReflectionPlan, settings: ReflectionSettings, step: int) -> bool:
     """Whether normals are propagated before ``step``: not before the scene is judged, not at a reset of either set."""
     every = settings.propagation.every
-    if not (every > 0 and step % every == 0 and plan.judged < step <= plan.propagation_until):
+    if not (every > 0 and step % every == 0 and settled(plan, step) and step <= plan.propagation_until):
         return False
     return not (opacity_reset_due(plan.base, step) or reflection_reset_due(plan, step))
 
 
+def settled(plan: ReflectionPlan, step: int) -> bool:
+    """Whether before ``step`` it is known that the stage goes on: what may hurt a matte scene waits for that."""
+    return plan.start < step and plan.judged <= step
+
+
+def base_reset_due(plan: ReflectionPlan, step: int) -> bool:
+    """Whether opacities and k_s of the base set are reset before ``step``; not while the scene is on probation."""
+    return opacity_reset_due(plan.base, step) and (step <= plan.start or settled(plan, step))
+
+
 def reflection_reset_due(plan: ReflectionPlan, step: int) -> bool:
     """Whether the reflection set's opacities are reset before ``step``; never before the scene is judged."""
-    return step > plan.judged and opacity_reset_due(plan.reflection, step)
+    return settled(plan, step) and opacity_reset_due(plan.reflection, step)
 
 
 def opacities_held(plan: ReflectionPlan, settings: ReflectionSettings, step: int) -> bool:

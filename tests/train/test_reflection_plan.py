@@ -9,6 +9,7 @@ import pytest
 from rtgs.config import compose
 from rtgs.train.schedule import (
     base_densify_due,
+    base_reset_due,
     densify_due,
     opacities_held,
     opacity_reset_due,
@@ -18,7 +19,7 @@ from rtgs.train.schedule import (
     sh_degree_at,
 )
 from rtgs.train.settings import ReflectionSettings
-from rtgs.train.specular_settings import PropagationSettings
+from rtgs.train.specular_settings import MatteSettings, PropagationSettings
 
 
 def paper(method: str):
@@ -36,7 +37,7 @@ def test_the_papers_boundaries():
     assert [step for step in steps if reflection_reset_due(plan, step)] == [6000, 12000, 18000]
     assert [step for step in steps if opacity_reset_due(plan.base, step)] == list(range(3000, 20000, 3000))
     assert [step for step in steps if propagation_due(plan, settings, step)] == [
-        step for step in range(5000, 19000, 1000) if step % 3000
+        step for step in range(4000, 19000, 1000) if step % 3000
     ]
     assert [step for step in steps if base_densify_due(plan, settings, step)][:28] == [
         *range(600, 3100, 100),
@@ -73,8 +74,23 @@ def test_boundaries_scale_with_the_run(total: int):
 
 
 def test_nothing_that_hurts_happens_before_the_scene_is_judged():
-    settings = ReflectionSettings(propagation=PropagationSettings(every=10), opacity_reset_every=10)
+    settings = ReflectionSettings(propagation=PropagationSettings(every=10), opacity_reset_every=15)
+    config, _ = compose(["scene=demo", "schedule.total=6000"])
+    plan = reflection_plan(settings, replace(config.schedule, opacity_reset_every=35, densify_until=3000))
+    assert (plan.start, plan.judged) == (300, 400)
+    on_probation = range(plan.start + 1, plan.judged)
+    assert any(opacity_reset_due(plan.base, step) for step in on_probation)
+    for due in (base_reset_due, reflection_reset_due):
+        assert not any(due(plan, step) for step in on_probation)
+        assert any(due(plan, step) for step in range(plan.judged, 600))
+    assert not any(propagation_due(plan, settings, step) for step in on_probation)
+    assert base_reset_due(plan, 280), "in the first stage as ever"
+    assert propagation_due(plan, settings, 410)
+
+
+def test_a_scene_that_is_never_judged_has_its_resets_from_the_start_of_the_stage():
+    settings = ReflectionSettings(opacity_reset_every=10, matte=MatteSettings(probation=0))
     config, _ = compose(["scene=demo", "schedule.total=6000"])
     plan = reflection_plan(settings, config.schedule)
-    early = range(plan.start, plan.judged + 1)
-    assert not any(propagation_due(plan, settings, step) or reflection_reset_due(plan, step) for step in early)
+    assert (plan.start, plan.judged) == (300, 300)
+    assert [step for step in range(290, 330) if reflection_reset_due(plan, step)] == [310, 320]
