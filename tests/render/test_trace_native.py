@@ -162,6 +162,35 @@ def test_no_hit_is_dropped(isa: str, count: int):
         torch.testing.assert_close(found.gradients[name], expected, rtol=0, atol=limit, msg=name)
 
 
+def test_more_hits_than_sixteen_bits_count():
+    """The tape of such a packet has wide rows, and its surfels are sorted by long keys."""
+    count, generator = 66_000, torch.Generator().manual_seed(4)
+    depth = torch.linspace(1, 11, count)[torch.randperm(count, generator=generator)]
+    column = torch.zeros(count)
+    axes = (torch.tensor([[1.0, 0, 0]]).repeat(count, 1), torch.tensor([[0.0, 1, 0]]).repeat(count, 1))
+    opacity = 2e-5 + 2e-5 * torch.rand(count, generator=generator)
+    feature = torch.randn(count, 1, generator=generator)
+    leaves = [opacity.clone().requires_grad_(), feature.clone().requires_grad_()]
+    means, scales = torch.stack((column, column, depth), 1), torch.full((count, 2), 50.0)
+    options = TraceOptions(transmittance_cutoff=0.0, alpha_cutoff=1e-5, depth=True)
+    ray = (torch.zeros(1, 3), torch.tensor([[0.0, 0.0, 1.0]]))
+    found = trace_surfels(means, *axes, scales, leaves[0], *ray, features=leaves[1], options=options)
+    order = depth.argsort()
+    exact = [leaf.detach().double().requires_grad_() for leaf in leaves]
+    alpha = exact[0][order]
+    before = torch.cat((alpha.new_ones(1), (1 - alpha).cumprod(0)[:-1]))
+    weight = alpha * before
+    expected = (weight.sum(), (weight * depth[order]).sum(), (weight * exact[1][order, 0]).sum())
+    actual = (found.alpha[0], output(found, "depth")[0], output(found, "features")[0, 0])
+    for one, other in zip(actual, expected, strict=True):
+        assert float(one.detach()) == pytest.approx(float(other.detach()), rel=2e-4)
+    upstream = (0.5, 1.0, 2.0)
+    by_native = torch.autograd.grad(sum(u * v for u, v in zip(upstream, actual, strict=True)), leaves)  # type: ignore[arg-type]
+    by_hand = torch.autograd.grad(sum(u * v for u, v in zip(upstream, expected, strict=True)), exact)  # type: ignore[arg-type]
+    for one, other in zip(by_native, by_hand, strict=True):
+        assert float((one.double() - other).abs().max()) <= 1e-4 * float(other.abs().max())
+
+
 @pytest.mark.parametrize(("surfels", "rays"), [(0, 5), (1, 5), (3, 0), (0, 0), (1, 1), (8, 17)])
 def test_small_sets(isa: str, surfels: int, rays: int):
     scene = native_trace_scene(surfels, rays, size=2.0)

@@ -1,0 +1,111 @@
+"""The reflection set: where it starts, how many of it a ray meets there, what its density control learns from."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from reflective_cases import new_method, recipe, schedule, tiny
+
+from rtgs.config import compose
+from rtgs.gaussians.surfels import activate
+from rtgs.methods import Stage
+from rtgs.methods.propagation import propagate_normals
+from rtgs.methods.reflection_set import reflection_surfels
+from rtgs.render.buffers import TraceOptions
+from rtgs.render.reference_trace import find_hits, traced_rays, traced_surfels
+from rtgs.train.settings import DensitySettings, ReflectionSettings
+from rtgs.train.specular_settings import PropagationSettings
+
+MOST_HITS = 80  # of a ray at the start (kernels.md: 32^3 x 5 whole surfels cost 161)
+
+
+def test_every_cell_of_the_box_gets_its_points():
+    settings = ReflectionSettings(cells=4, per_cell=3, box_half=2.0)
+    surfels = reflection_surfels(settings, torch.empty(0, 3), 1.0, torch.Generator().manual_seed(0))
+    cell = surfels.means.detach() + 2
+    assert float(cell.min()) >= 0
+    assert float(cell.max()) <= 4
+    number = (cell.floor().long() * torch.tensor([16, 4, 1])).sum(1)
+    assert torch.equal(number.bincount(minlength=64), torch.full((64,), 3))
+    within = (cell - cell.floor()).std(dim=0)
+    assert bool((within > 0.25).all()), "anywhere in its cell: 0.29 for uniform points"
+    colors = 0.5 + 0.28209479 * surfels.sh_dc.detach()
+    assert 0 <= float(colors.min()) < 0.1
+    assert 0.9 < float(colors.max()) <= 1
+    torch.testing.assert_close(surfels.opacity_logits.detach().sigmoid(), torch.full((192,), 0.1))
+
+
+def hits_a_ray(settings: ReflectionSettings) -> float:
+    """Mean over rays from the middle of the box, where the surfaces are, to everywhere."""
+    generator = torch.Generator().manual_seed(1)
+    surfels = reflection_surfels(replace(settings, box_half=1.0), torch.empty(0, 3), 1.0, generator)
+    active = activate(surfels, torch.zeros(3), 0)
+    geometry = {name: getattr(active, name).detach() for name in ("means", "tangent_u", "tangent_v", "scales")}
+    geometry["opacities"] = active.opacities.detach()
+    options = TraceOptions(alpha_cutoff=settings.alpha_cutoff, transmittance_cutoff=settings.transmittance_cutoff)
+    origins = 0.3 * (2 * torch.rand(60, 3, generator=generator) - 1)
+    rays = traced_rays(origins, torch.randn(60, 3, generator=generator), options)
+    met = traced_surfels(geometry, None, None, None, None, options.alpha_cutoff)
+    hits = find_hits(met, rays, options.alpha_cutoff, options.transmittance_cutoff)
+    return float(hits.contributes.sum(1).double().mean())
+
+
+@pytest.mark.parametrize("preset", ["smoke", "quick", "standard"])
+def test_rays_meet_few_surfels_at_the_start(preset: str):
+    config, _ = compose(["scene=demo", "method=rtgs", f"preset={preset}"])
+    assert 1 < hits_a_ray(config.method.reflection) < MOST_HITS
+
+
+def test_density_control_learns_from_the_tracers_signal():
+    """Sum over hits of dL/dmean * 0.5 * t, by its norm per set and step; nothing is cloned where it stays below."""
+    grown = []
+    for threshold in (1e-9, 1e9):
+        density = DensitySettings(gradient_threshold=threshold, min_opacity=1e-4, too_large=0)
+        quiet = PropagationSettings(every=0)
+        method = new_method(recipe(density=density, propagation=quiet), made := tiny(), schedule())
+        method.begin(Stage("reflection", 15, 60))
+        assert method.reflection is not None
+        before = len(method.reflection)
+        for step in range(15, 20):
+            view = made.scene.train[step % len(made.scene.train)]
+            method.losses(method.render(view.camera, step), view, step).total.backward()
+            if step == 15:
+                observed = method.reflection._observation
+                assert observed is not None
+                signal, moved = observed.probe.grad, method.reflection.surfels.means.grad
+                assert signal is not None
+                assert moved is not None
+                assert torch.equal(signal.any(1), moved.any(1))
+                met = moved.any(1)
+                along = torch.nn.functional.cosine_similarity(signal[met], moved[met])
+                assert float(along.median()) > 0.9, "half t times the gradient of the mean, hit by hit"
+            method.after_step(step)
+        grown.append(len(method.reflection) - before)
+    assert grown[0] > 0
+    assert grown[1] == 0
+
+
+def test_a_propagation_disturbs_the_colours_of_matte_surfels_alone():
+    method = new_method(recipe(), tiny(), schedule())
+    method.begin(Stage("reflection", 15, 60))
+    base, settings = method.base, PropagationSettings()
+    with torch.no_grad():
+        base.surfels.specular_logits.copy_(torch.linspace(-7, 1, len(base)))  # type: ignore[union-attr]
+        base.surfels.opacity_logits.copy_(torch.linspace(-3, 5, len(base)))
+    before = base.surfels.detached()
+    specular = before.specular_logits.sigmoid()  # type: ignore[union-attr]
+    propagate_normals(base, settings, torch.Generator().manual_seed(0))
+    after = base.surfels.detached()
+    noise = (after.sh_dc - before.sh_dc)[specular <= settings.sabotage_border]
+    assert float(noise.abs().max()) <= settings.sabotage + 1e-6
+    assert float(noise.std()) == pytest.approx(2 * settings.sabotage / 12**0.5, rel=0.1)
+    assert torch.equal(
+        after.sh_dc[specular > settings.sabotage_border], before.sh_dc[specular > settings.sabotage_border]
+    )
+    grown = (after.log_scales - before.log_scales).exp()
+    expected = torch.where(specular >= settings.grow_border, settings.grow, 1.0)[:, None].expand_as(grown)
+    torch.testing.assert_close(grown, expected)
+    opaque = before.opacity_logits.sigmoid().clamp_min(settings.opacity)
+    torch.testing.assert_close(after.opacity_logits.sigmoid(), opaque)
