@@ -16,6 +16,7 @@ from benchmarks.glass_ladder import (
     CHOICES,
     LADDER,
     RUNGS,
+    Setting,
     base_config,
     bright_pixels,
     named,
@@ -65,6 +66,22 @@ def test_rungs_share_the_stages_that_do_not_differ(tmp_path: Path):
     assert len(first) == 2, "L_mono of another weight is another first stage"
     assert len(second) == 3, "and without a third stage the second goes on to the end"
     assert len({key["train_transmittance"] for name, key in keys.items() if name != "two_stages"}) == 7
+
+
+@pytest.mark.parametrize("size", ["small", "preset"])
+def test_the_papers_way_has_no_interface_at_any_size(tmp_path: Path, size: str):
+    arguments = SimpleNamespace(preset="quick", size=size, set=[], root=tmp_path)
+    config = base_config("ball_statue", arguments)  # type: ignore[arg-type]
+    setting = Setting("ball_statue", tmp_path / "split.json", tmp_path / "container.ply", ())
+    assert config.method.transmittance.interface.count > 0
+    words = ["scene=ball_statue", "method=rtgs", "preset=quick", *sized(arguments)]  # type: ignore[arg-type]
+    chosen = compose([*words, *RUNGS["paper"].words(setting, config)])[0].method.transmittance
+    assert (chosen.interface.count, chosen.split, chosen.first_surface) == (0, False, "base")
+    assert all(
+        "method.transmittance.interface.count=0" in RUNGS[name].words(setting, config)
+        for name in RUNGS
+        if name.startswith("paper")
+    )
 
 
 def test_groups_are_rungs_named_once():
