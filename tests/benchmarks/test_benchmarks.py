@@ -140,6 +140,14 @@ def test_speed_error_end_to_end(run, tmp_path: Path) -> None:
     assert all(point["psnr"] > 0 and point["cpu_seconds"] > 0 for point in points)
 
 
+def test_every_lever_is_measured_end_to_end() -> None:
+    reference, *others = trace_training.SETTINGS.values()
+    turned = {word for words in others for word in words if word not in reference}
+    keys = {word.split("=")[0].removeprefix("method.reflection.") for word in turned}
+    assert keys == {"traced.threshold", "traced.share", "rebuild_every", "transmittance_cutoff", "alpha_cutoff"}
+    assert trace_training.HALVED in trace_training.SETTINGS, "the resolution is turned by the scene"
+
+
 def test_equal_time_is_found_from_two_runs() -> None:
     def point(steps: int) -> trace_training.EndToEndPoint:
         return trace_training.EndToEndPoint("a", "steps", steps, 1e-4 * steps**1.5, None, None)
