@@ -1,0 +1,73 @@
+"""The second stage does what its settings and its plan say: events, options of the trace, which pixels are traced."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from reflective_cases import new_method, recipe, schedule, tiny
+
+from rtgs.methods import RenderOptions, Stage
+from rtgs.optics.settings import OpticsSettings
+from rtgs.train.schedule import (
+    base_densify_due,
+    base_reset_due,
+    densify_due,
+    propagation_due,
+    reflection_reset_due,
+)
+from rtgs.train.specular_settings import MaterialSettings, TracedShareSettings
+
+
+def test_every_event_of_the_plan_happens_and_no_other():
+    made = tiny()
+    method = new_method(recipe(), made, schedule())
+    method.begin(Stage("reflection", 15, 60))
+    told = set()
+    for step in range(15, 59):
+        view = made.scene.train[step % len(made.scene.train)]
+        method.losses(method.render(view.camera, step), view, step).total.backward()
+        told |= {(step + 1, event.kind, event.set_name) for event in method.after_step(step)}
+    plan, settings = method.plan, method.settings.reflection
+    expected = set()
+    for step in range(16, 60):
+        due = {
+            ("density", "base"): base_densify_due(plan, settings, step),
+            ("density", "reflection"): densify_due(plan.reflection, step),
+            ("opacity_reset", "base"): base_reset_due(plan, step),
+            ("opacity_reset", "reflection"): reflection_reset_due(plan, step),
+            ("propagation", "base"): propagation_due(plan, settings, step),
+        }
+        expected |= {(step, *event) for event, happens in due.items() if happens}
+    assert {event[1:] for event in expected} == {*due}, "each kind at least once"
+    assert told == expected
+
+
+def test_the_trace_has_the_options_of_the_settings():
+    chosen = {"alpha_cutoff": 1 / 64, "transmittance_cutoff": 1e-2, "direction_gradient": "last_sh"}
+    chosen |= {"sh_direction": "raw"}
+    method = new_method(recipe(**chosen, offset=0.01), tiny(), schedule())
+    method.begin(Stage("reflection", 15, 60))
+    options = method._trace_options(20, True)
+    assert {name: getattr(options, name) for name in chosen} == chosen
+    assert options.t_min == pytest.approx(0.01 * method.extent)
+    assert options.weight_sum
+    assert [method._trace_options(step, False).sh_degree for step in (15, 25, 45)] == [0, 1, 3]
+
+
+@pytest.mark.parametrize(("gain", "shown"), [(1.0, False), (16.0, True)])
+def test_a_gain_above_one_counts_towards_the_threshold(gain: float, shown: bool):
+    """k_s is 0.3 everywhere; only where w_r is several times 1 does it reach 1."""
+    optics, materials = OpticsSettings(max_gain=gain), MaterialSettings(specular=0.3)
+    settings = recipe(traced=TracedShareSettings(threshold=1.0))
+    made = tiny()
+    method = new_method(replace(settings, optics=optics, materials=materials), made, schedule())
+    method.begin(Stage("reflection", 15, 60))
+    with torch.no_grad():
+        method.base.surfels.opacity_logits += 3
+        layers = method.render(made.scene.test[0].camera, 15, RenderOptions(layers=True)).layers
+    assert layers is not None
+    assert bool(layers.traced.any()) is shown
+    if shown:
+        assert float(layers.traced.float().mean()) > 0.5
