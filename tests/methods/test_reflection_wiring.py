@@ -8,7 +8,8 @@ import pytest
 import torch
 from reflective_cases import new_method, recipe, schedule, tiny
 
-from rtgs.methods import RenderOptions, Stage
+from rtgs.methods import RenderOptions, Stage, reflective
+from rtgs.methods.traced_pixels import choose_pixels
 from rtgs.optics.settings import OpticsSettings
 from rtgs.train.schedule import (
     base_densify_due,
@@ -17,7 +18,7 @@ from rtgs.train.schedule import (
     propagation_due,
     reflection_reset_due,
 )
-from rtgs.train.specular_settings import MaterialSettings, TracedShareSettings
+from rtgs.train.specular_settings import MaterialSettings, MatteSettings, TracedShareSettings
 
 
 def test_every_event_of_the_plan_happens_and_no_other():
@@ -71,3 +72,21 @@ def test_a_gain_above_one_counts_towards_the_threshold(gain: float, shown: bool)
     assert bool(layers.traced.any()) is shown
     if shown:
         assert float(layers.traced.float().mean()) > 0.5
+
+
+def test_rays_are_shared_in_training_alone_and_not_before_the_scene_is_judged(monkeypatch: pytest.MonkeyPatch):
+    settings = recipe(traced=TracedShareSettings(shared_below=0.15), matte=MatteSettings(probation=0.5))
+    made, asked = tiny(), []
+    method = new_method(settings, made, schedule())
+    method.begin(Stage("reflection", 15, 60))
+    assert method.plan.judged == 45
+
+    def recorded(*arguments):
+        asked.append(arguments[2].shared_below)
+        return choose_pixels(*arguments)
+
+    monkeypatch.setattr(reflective, "choose_pixels", recorded)
+    for step in (15, 44, 45):
+        method.render(made.scene.train[0].camera, step)
+    method.render(made.scene.test[0].camera, 50, RenderOptions())
+    assert asked == [0, 0, 0.15, 0]
