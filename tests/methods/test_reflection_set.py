@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import pytest
@@ -13,6 +14,7 @@ from rtgs.gaussians.surfels import activate
 from rtgs.methods import Stage
 from rtgs.methods.propagation import propagate_normals
 from rtgs.methods.reflection_set import reflection_surfels
+from rtgs.methods.traced_set import FollowingTree, trace_set
 from rtgs.render.buffers import TraceOptions
 from rtgs.render.reference_trace import find_hits, traced_rays, traced_surfels
 from rtgs.train.settings import DensitySettings, ReflectionSettings
@@ -85,6 +87,46 @@ def test_density_control_learns_from_the_tracers_signal():
         grown.append(len(method.reflection) - before)
     assert grown[0] > 0
     assert grown[1] == 0
+
+
+def test_the_tree_follows_every_change_of_the_set():
+    method = new_method(recipe(), tiny(), schedule())
+    method.begin(Stage("reflection", 15, 60))
+    part, options = method.reflection, method._trace_options(15, False)
+    assert part is not None
+    with torch.no_grad():
+        part.surfels.log_scales -= 1  # boxes that a stale tree cannot hit by luck
+    generator = torch.Generator().manual_seed(0)
+    beams = torch.randn(2, 40, 3, generator=generator).repeat_interleave(16, dim=1)  # narrow: a packet meets few boxes
+    rays = tuple(beam + 0.01 * torch.randn(640, 3, generator=generator) for beam in beams)
+
+    def seen() -> torch.Tensor:
+        """Through the set's own tree, which must be as good as a new one."""
+        alpha = part.trace(*rays, options, watched=False).alpha.detach()
+        assert torch.equal(alpha, trace_set(part.surfels, FollowingTree(1), *rays, options).alpha.detach())
+        return alpha
+
+    start = part.surfels.means.detach().clone()
+
+    def shifted() -> None:
+        """As a whole: neighbours stay neighbours, so that old boxes are tight."""
+        with torch.no_grad():
+            part.surfels.means.copy_(start + 3 * torch.randn(1, 3, generator=generator))
+
+    pictures, state = [seen()], {name: tensor.clone() for name, tensor in part.state().items()}
+    for change in (
+        lambda: part.step(15, 0),
+        lambda: part.perturb(15, generator),
+        lambda: part.load(state),
+        part.reset_opacity,
+        lambda: part.densify(generator),
+    ):
+        shifted()
+        change()
+        pictures.append(seen())
+    different = [not torch.equal(one, other) for one, other in itertools.pairwise(pictures)]
+    assert all(different)
+    assert torch.equal(pictures[3], pictures[0]), "as it was when the state was taken"
 
 
 def test_a_propagation_disturbs_the_colours_of_matte_surfels_alone():
