@@ -98,12 +98,13 @@ def test_the_tree_follows_every_change_of_the_set():
         part.surfels.log_scales -= 1  # boxes that a stale tree cannot hit by luck
     generator = torch.Generator().manual_seed(0)
     beams = torch.randn(2, 40, 3, generator=generator).repeat_interleave(16, dim=1)  # narrow: a packet meets few boxes
-    rays = tuple(beam + 0.01 * torch.randn(640, 3, generator=generator) for beam in beams)
+    rays = [beam + 0.01 * torch.randn(640, 3, generator=generator) for beam in beams]
 
     def seen() -> torch.Tensor:
         """Through the set's own tree, which must be as good as a new one."""
         alpha = part.trace(*rays, options, watched=False).alpha.detach()
-        assert torch.equal(alpha, trace_set(part.surfels, FollowingTree(1), *rays, options).alpha.detach())
+        fresh = trace_set(part.surfels, FollowingTree(1), *rays, options)  # type: ignore[arg-type]
+        assert torch.equal(alpha, fresh.alpha.detach())
         return alpha
 
     start = part.surfels.means.detach().clone()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -46,7 +47,7 @@ def test_every_event_of_the_plan_happens_and_no_other():
 
 
 def test_the_trace_has_the_options_of_the_settings():
-    chosen = {"alpha_cutoff": 1 / 64, "transmittance_cutoff": 1e-2, "direction_gradient": "last_sh"}
+    chosen: dict[str, Any] = {"alpha_cutoff": 1 / 64, "transmittance_cutoff": 1e-2, "direction_gradient": "last_sh"}
     chosen |= {"sh_direction": "raw"}
     method = new_method(recipe(**chosen, offset=0.01), tiny(), schedule())
     method.begin(Stage("reflection", 15, 60))
