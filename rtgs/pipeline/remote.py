@@ -75,7 +75,10 @@ class RemoteStore:
             return None
         except Exception as error:
             raise self._unreachable(error) from error
-        content = json.loads(text)
+        try:
+            content = json.loads(text)
+        except ValueError:
+            content = None
         sent = content.pop("sent", "") if isinstance(content, dict) else None
         found = Manifest.parse(content)
         wanted = found is not None and (found.step, found.fingerprint) == (name, fingerprint)
@@ -115,10 +118,21 @@ class RemoteStore:
                 target = f"{folder}/{sent}/{file}"
                 self._fs.makedirs(target.rpartition("/")[0], exist_ok=True)
                 self._fs.put_file(str(artifact.folder / file), target)
-            self._fs.pipe_file(f"{folder}/{manifests.NAME}", json.dumps(content).encode())
+            self._write_whole(f"{folder}/{sent}", f"{folder}/{manifests.NAME}", json.dumps(content).encode())
         except Exception as error:
             raise self._unreachable(error) from error
         return True
+
+    def _write_whole(self, aside: str, path: str, content: bytes) -> None:
+        """Nobody reads half of it: an object store writes a file at once, other file systems rename one."""
+        from fsspec.spec import AbstractFileSystem
+
+        if type(self._fs).mv is AbstractFileSystem.mv:  # a copy and a removal, no rename
+            self._fs.pipe_file(path, content)
+            return
+        self._fs.makedirs(aside, exist_ok=True)
+        self._fs.pipe_file(f"{aside}/{manifests.NAME}", content)
+        self._fs.mv(f"{aside}/{manifests.NAME}", path)
 
     def fetch(self, name: str, fingerprint: str, store: Store) -> Artifact | None:
         """Bring an artifact into ``store``, every digest checked; None when there is none.

@@ -74,7 +74,7 @@ def test_pushing_twice_sends_once(tmp_path, url):
     assert [remote.push(artifact) for artifact in store.artifacts()] == [False] * 5
 
 
-def test_two_senders_of_one_recipe_never_mix_their_files(tmp_path, url):
+def test_two_senders_of_one_recipe_never_mix_their_files(tmp_path, url, monkeypatch):
     """The second finds no manifest, because the first has not got there yet; their bytes differ."""
     remote, steps = RemoteStore(url), graph(tmp_path)
     one, two = (Store(tmp_path / name / "store") for name in ("one", "two"))
@@ -86,21 +86,64 @@ def test_two_senders_of_one_recipe_never_mix_their_files(tmp_path, url):
     assert manifest is not None
     describe(step, two.folder(step), 2.0, manifest.created).write(two.folder(step))
 
+    def gone(*_):
+        raise OSError("gone")
+
     class Late(RemoteStore):
         """Has looked before the other's manifest came, and is overtaken while it sends."""
 
         def manifest(self, name, fingerprint):
             return None
 
-    first, second = one.find(step), two.find(step)
-    assert first is not None
-    assert second is not None
-    for artifact in (first, second):
-        assert Late(url).push(artifact)
-        fetched = remote.fetch(step.name, step.fingerprint, Store(tmp_path / artifact.folder.parts[-5] / "again"))
+    def finds(artifact, machine):
+        fetched = remote.fetch(step.name, step.fingerprint, Store(tmp_path / machine / "store"))
         assert fetched is not None
         assert fetched.manifest == artifact.manifest
         assert (fetched.folder / "result.txt").read_bytes() == (artifact.folder / "result.txt").read_bytes()
+
+    first, second = one.find(step), two.find(step)
+    assert first is not None
+    assert second is not None
+    assert Late(url).push(first)
+    finds(first, "three")
+    with monkeypatch.context() as patch:
+        patch.setattr(RemoteStore, "_write_whole", gone)
+        with pytest.raises(RemoteStoreError, match="gone"):
+            Late(url).push(second)
+    finds(first, "four")  # the second's files are there, its manifest is not
+    assert Late(url).push(second)
+    finds(second, "five")
+
+
+def test_half_a_manifest_is_never_read(tmp_path, monkeypatch):
+    """In a folder, a file that is being written can be read; on an object store it cannot."""
+    url = str(tmp_path / "shared")
+    remote, step = RemoteStore(url), graph(tmp_path)[0]
+    store = Store(tmp_path / "store")
+    InlineExecutor(store).execute(make_plan([step], store))
+    write, seen = remote._fs.pipe_file, []
+
+    def slowly(path, value, **more):
+        write(path, value[: len(value) // 2], **more)
+        seen.append(remote.manifest(step.name, step.fingerprint))
+        write(path, value, **more)
+
+    artifact = store.find(step)
+    assert artifact is not None
+    with monkeypatch.context() as patch:
+        patch.setattr(remote._fs, "pipe_file", slowly)
+        assert remote.push(artifact)
+    assert seen == [None]
+    assert remote.manifest(step.name, step.fingerprint) == artifact.manifest
+
+
+def test_a_manifest_that_is_none_is_told(tmp_path, url):
+    remote = RemoteStore(url)
+    run(tmp_path, "one", remote)
+    step = graph(tmp_path)[0]
+    remote._fs.pipe_file(f"{remote._folder(step.name, step.fingerprint)}/{NAME}", b'{"step": "tr')
+    with pytest.raises(RemoteStoreError, match="is not one of that artifact"):
+        make_plan([step], Store(tmp_path / "two" / "store"), remote)
 
 
 def test_an_artifact_without_its_manifest_does_not_exist(tmp_path, url):
