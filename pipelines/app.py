@@ -115,7 +115,7 @@ def _tracked(
         results = InlineExecutor(stores.local, tracking, stores.remote).execute(plan)
         folder = write_run_folder(config, choices, command, results)
         track_end(tracker, folder, results)
-    note_tracked(folder, _place(config, tracking))
+    note_tracked(folder, results, _place(config, tracking))
     return results, folder
 
 

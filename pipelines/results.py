@@ -58,11 +58,14 @@ class RunRecord:
         return None
 
 
-def note_tracked(folder: Path, place: str) -> None:
-    """Write into the record of a run folder that the tracker at ``place`` has this run."""
-    record = RunRecord.read(folder)
-    if record is not None and place not in record.tracked:
-        _write_record(folder, replace(record, tracked=(*record.tracked, place)))
+def note_tracked(folder: Path, results: Sequence[StepResult], place: str) -> None:
+    """Write into the record of a run folder that the tracker at ``place`` has this run, unless another run of that name
+    has the folder by now."""
+    steps = _keys(results)
+    with _folder_lock(folder):
+        record = RunRecord.read(folder)
+        if record is not None and record.steps == steps and place not in record.tracked:
+            _write_record(folder, replace(record, tracked=(*record.tracked, place)))
 
 
 def is_tracked(config: RunConfig, plan: Plan, place: str) -> bool:
@@ -83,10 +86,17 @@ def write_run_folder(config: RunConfig, choices: Choices, command: str, results:
     other sets under their own names), ``mesh.ply`` when asked for, ``config.yaml``, ``run.json``.
     """
     folder = config.paths.runs / str(config.name)
-    steps = {result.step.name: result.step.fingerprint for result in results}
     config.paths.runs.mkdir(parents=True, exist_ok=True)
-    with FileLock(str(config.paths.runs / f".{config.name}.lock")):
-        return _fill_run_folder(folder, config, choices, command, results, steps)
+    with _folder_lock(folder):
+        return _fill_run_folder(folder, config, choices, command, results, _keys(results))
+
+
+def _folder_lock(folder: Path) -> FileLock:
+    return FileLock(str(folder.with_name(f".{folder.name}.lock")))
+
+
+def _keys(results: Sequence[StepResult]) -> dict[str, str]:
+    return {result.step.name: result.step.fingerprint for result in results}
 
 
 def _fill_run_folder(

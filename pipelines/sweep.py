@@ -17,7 +17,7 @@ from omegaconf import DictConfig
 from pipelines.planning import Job, describe, merge_jobs, remote_store
 from rtgs.config.schema import RunConfig
 from rtgs.errors import RtgsError
-from rtgs.pipeline import RemoteStore, Step, Store, SweepOutcomes, make_plan
+from rtgs.pipeline import RemoteStore, Step, Store, SweepOutcomes, make_plan, topological
 from rtgs.pipeline.engine import DaskExecutor, EngineSettings, WorkerJob, open_client
 from rtgs.track import RunInfo
 from rtgs.track.source import git_tags
@@ -61,6 +61,8 @@ class SweepStart(Callback):
     def on_multirun_start(self, config: DictConfig, **_: object) -> None:
         """Hydra calls this before any job."""
         SweepStart.sweep = _sweep(config.hydra)
+        for left in SweepStart.sweep.folder.glob("error_*.txt"):  # of another sweep that was given this folder
+            left.unlink(missing_ok=True)
 
 
 def current_sweep() -> Sweep | None:
@@ -115,7 +117,7 @@ def check_arrived(
             seconds in which a network disk may show it.
     """
     until = time.monotonic() + patience
-    for step in targets:
+    for step in topological(targets):  # jobs look for what their results were made of, too
         outcome = outcomes.outcomes[step.fingerprint]
         while not outcome.failed and store.find(step) is None:
             if remote is not None and remote.manifest(step.name, step.fingerprint) is not None:

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,9 +21,10 @@ import yaml
 from PIL import Image
 from safetensors import SafetensorError
 
-from pipelines import import_scene
+from pipelines import import_scene, results
 from pipelines.cli import main, report_error
 from pipelines.import_scene import ImportParams
+from pipelines.results import RunRecord
 from pipelines.words import friendly_overrides
 from rtgs.pipeline import Store
 from rtgs.pipeline.step import StepFailed
@@ -218,6 +220,19 @@ def test_a_run_that_was_not_tracked_is_recorded_once_a_tracker_is_on(words, firs
     shutil.rmtree(root / "tracking")
     assert main([*words, "tracking=jsonl"]) == 0
     assert recorded() == 1
+
+
+def test_a_tracked_run_is_noted_only_in_its_own_folder(tmp_path):
+    """Another run of the name may have taken the folder while the tracker was closed."""
+    folder = tmp_path / "named"
+    folder.mkdir()
+    mine = [SimpleNamespace(step=SimpleNamespace(name="train", fingerprint="a"))]
+    for steps, places in (({"train": "b"}, ()), ({"train": "a"}, ("here",))):
+        results._write_record(folder, RunRecord("named", "rtgs run", "now", {}, steps))
+        results.note_tracked(folder, mine, "here")  # type: ignore[arg-type]
+        record = RunRecord.read(folder)
+        assert record is not None
+        assert (record.steps, record.tracked) == (steps, places)
 
 
 def test_sweeps_share_steps_and_end_with_a_table(words, first, root, capsys):

@@ -21,7 +21,16 @@ from toy import ToyParams, executions, graph
 
 from pipelines.sweep import check_arrived
 from rtgs.errors import RtgsError
-from rtgs.pipeline import InlineExecutor, RemoteStore, Step, StepUnfinished, Store, SweepOutcomes, make_plan
+from rtgs.pipeline import (
+    InlineExecutor,
+    RemoteStore,
+    Step,
+    StepUnfinished,
+    Store,
+    SweepOutcomes,
+    make_plan,
+    topological,
+)
 from rtgs.pipeline.engine import WORKER, DaskExecutor, EngineSettings, WorkerJob, open_client, worker_environment
 from rtgs.pipeline.outcome import StepOutcome
 
@@ -217,16 +226,24 @@ def test_what_workers_keep_to_themselves_is_not_run_again_here(tmp_path):
     theirs, here = Store(tmp_path / "theirs"), Store(tmp_path / "here")
     InlineExecutor(theirs).execute(make_plan([target], theirs))
     outcome = StepOutcome("train", target.fingerprint, theirs.folder(target), 1.0, True)
-    outcomes = SweepOutcomes({target.fingerprint: outcome})
-    with pytest.raises(RtgsError, match=r"train \w+ is finished in .*theirs.* not in .*here here: .*paths\.remote"):
+    outcomes = SweepOutcomes(
+        {
+            step.fingerprint: replace(outcome, step=step.name, folder=theirs.folder(step))
+            for step in topological([target])
+        }
+    )
+    with pytest.raises(RtgsError, match=r"prep \w+ is finished in .*theirs.* not in .*here here: .*paths\.remote"):
         check_arrived([target], outcomes, here, None, patience=0.0)
     check_arrived([target], outcomes, theirs, None, patience=0.0)
     remote = RemoteStore(str(tmp_path / "shared"))
-    artifact = theirs.find(target)
-    assert artifact is not None
-    remote.push(artifact)
+    for number, artifact in enumerate(sorted(theirs.artifacts(), key=lambda one: one.manifest.step != "train")):
+        if number:  # the result alone is not enough
+            with pytest.raises(RtgsError, match="is not in"):
+                check_arrived([target], outcomes, here, remote, patience=0.0)
+        remote.push(artifact)
     check_arrived([target], outcomes, here, remote, patience=0.0)
-    failed = SweepOutcomes({target.fingerprint: replace(outcome, folder=None, problem="no")})
+    lost = {key: replace(one, folder=None, problem="no") for key, one in outcomes.outcomes.items()}
+    failed = SweepOutcomes(lost)
     check_arrived([target], failed, here, None, patience=0.0)
 
 

@@ -8,9 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from omegaconf import OmegaConf
 from PIL import Image
 
 from pipelines.cli import main
+from pipelines.sweep import SweepStart
 from rtgs.pipeline import Store
 
 QUICK = (
@@ -155,6 +157,17 @@ def test_a_stock_launcher_with_its_own_processes_ends_the_same_way(capture, tmp_
         assert f"schedule.densify_every is {value}" in captured.out
     assert (tmp_path / "runs" / "row-2dgs-smoke" / "report.html").is_file()
     assert "2dgs" in (tmp_path / "tables" / "mine-smoke" / "table.md").read_text()
+
+
+def test_errors_that_another_sweep_left_in_the_folder_are_not_told(tmp_path, monkeypatch):
+    monkeypatch.setattr(SweepStart, "sweep", None)
+    hydra = {"sweep": {"dir": str(tmp_path)}, "runtime": {"choices": {}}, "launcher": {"_target_": "a.JoblibLauncher"}}
+    for left in ("old", ""):
+        SweepStart().on_multirun_start(OmegaConf.create({"hydra": hydra}))
+        assert SweepStart.sweep is not None
+        assert SweepStart.sweep.elsewhere
+        assert SweepStart.sweep.error_of(0) == ""
+        SweepStart.sweep.leave_error(0, RuntimeError(left))
 
 
 @pytest.mark.parametrize(
