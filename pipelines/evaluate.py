@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -94,13 +95,14 @@ def object_facts(folder: Path, scene: Scene) -> ObjectFacts:
         hit_shares((guide.surfaces(view.camera), mask) for view in views if (mask := bounding(view.mask)) is not None)
         for views in (scene.train, scene.test)
     )
+    front, back = (truth.get(f"{side}_within_3_percent") for side in ("front", "back"))  # NaN: no pixel to judge
     return ObjectFacts(
         source=mesh.source,
         flat=mesh.flat,
         silhouette_iou=record.get("silhouette_iou"),
         distance=distance,
-        front=truth.get("front_within_3_percent"),
-        back=truth.get("back_within_3_percent"),
+        front=None if front is None or math.isnan(front) else front,
+        back=None if back is None or math.isnan(back) else back,
         one_hit=train[0],
         no_hit=train[1],
         no_hit_test=test[1],

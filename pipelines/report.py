@@ -144,8 +144,11 @@ def _guide(table: EvaluationTable) -> list[Decision]:
         return []
     lines = [Decision("rays without two surfaces", known.fallbacks)]
     if known.distance is not None:
-        why = f"{known.distance:.4f} of its diagonal on average; first surface within 3 % for {known.front:.3f} of the "
-        lines.append(Decision("mesh and true container", f"{why}pixels, second for {known.back:.3f}"))
+        front, back = ("none to judge" if share is None else f"{share:.3f}" for share in (known.front, known.back))
+        why = (
+            f"{known.distance:.4f} of its diagonal on average; share of the pixels whose surface is within 3 %: first "
+        )
+        lines.append(Decision("mesh and true container", f"{why}{front}, second {back}"))
     return lines
 
 

@@ -60,7 +60,11 @@ class _Candidates:
         """The panes that somebody drew, where they explain the masks."""
         if not self.panes:
             return None
-        pane = drawn_pane(self.panes, self.masks.views)
+        try:
+            pane = drawn_pane(self.panes, self.masks.views)
+        except RtgsError as error:
+            self.decisions.append(("drawn panes not taken", str(error)))
+            return None
         self.scores["drawn panes"] = score = self.score(pane.mesh).mean
         if score >= self.settings.pane.agree:
             return ObjectMesh(pane.mesh, "given", pane.voxel, flat=True)

@@ -167,7 +167,8 @@ class GlassStage(ReflectiveMethod):
             assert isinstance(self.base.surfels, Surfels)
             inside = rows_inside(self.base.surfels, mesh, settings.split_margin * mesh.voxel, cameras)
         found = int(inside.sum())
-        if settings.init.min_points <= found < len(inside):
+        some_stay = mesh.flat or found < len(inside)
+        if settings.init.min_points <= found and some_stay:
             kept = torch.ones_like(kept) if mesh.flat else kept  # what is behind a pane is seen beside it, too
             surfels, detail = take_out(self.base, inside, kept), f"{found} base surfels {where}"
             if mesh.flat:
@@ -179,7 +180,8 @@ class GlassStage(ReflectiveMethod):
         else:
             box = initial_box(settings, mesh, cameras, self._points)
             surfels = random_surfels(settings, box, self.generator)
-            why = f", for only {found} base surfels are {where}" if settings.split else ""
+            many = f"only {found}" if some_stay else f"all {found}"
+            why = f", for {many} base surfels are {where}" if settings.split else ""
             detail = f"{len(surfels)} random surfels in the box of the {settings.box}{why}"
         self.transmittance = self._transmittance_set(surfels)
         return StepEvent("begin", "transmittance", detail)

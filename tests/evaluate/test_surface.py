@@ -8,11 +8,15 @@ import json
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
+from pipelines.evaluate import object_facts
+from pipelines.report import _guide
 from rtgs.evaluate.evaluate import (
     EvaluationSettings,
     EvaluationTable,
@@ -25,6 +29,9 @@ from rtgs.evaluate.evaluate import (
 from rtgs.evaluate.publish import Measured, TableSpec, build_table
 from rtgs.evaluate.surface import SURFACE_METRICS, ObjectFacts, hit_shares, surface_scores
 from rtgs.evaluate.table_formats import comma_separated, markdown
+from rtgs.mesh.container import ObjectMesh, write_object_mesh
+from rtgs.mesh.score import container_mesh, hit_score
+from tests.mesh.shapes import camera_at
 
 QUICK = EvaluationSettings(lpips=False, eight_bit=False)
 KNOWN = ObjectFacts("hull", False, 0.97, 0.0012, 0.99, 0.98, 0.02, 0.005, 0.01)
@@ -137,3 +144,22 @@ def test_a_published_table_has_them_and_real_captures_only_the_silhouettes():
     text = markdown(build_table(spec, [Measured(replace(evaluated(known=real), rows=rows), 0)]))
     assert "IoU of mesh and masks" in text
     assert "path-traced scenes\n" not in text
+
+
+def test_what_no_pixel_can_tell_is_none_and_the_table_is_written(tmp_path: Path):
+    """A pane has no second surface to judge: a share of no pixels is NaN, which JSON has not."""
+    true = container_mesh("ball_statue")
+    assert true is not None
+    middle, size = true.vertices.mean(0), float(true.vertices.max() - true.vertices.min())
+    camera = camera_at(tuple(middle - np.array([0, 2 * size, 0])), tuple(middle), width=24, height=18, focal=24)
+    pane = ObjectMesh(true, "given", 0.1, flat=True)
+    hits = hit_score(pane, true, [camera])
+    assert math.isnan(hits.back)
+    truth = {"distance": 0.1, "front_within_3_percent": hits.front, "back_within_3_percent": hits.back}
+    write_object_mesh(tmp_path, pane, {"silhouette_iou": 1.0, "truth": truth})
+    known = object_facts(tmp_path, SimpleNamespace(name="ball_statue", train=(), test=()))  # type: ignore[arg-type]
+    assert (known.front, known.back) == (hits.front, None)
+    table = evaluated(known=known)
+    write_json(tmp_path / "metrics.json", table)
+    assert read_json(tmp_path / "metrics.json").object == known
+    assert _guide(table)[-1].why.endswith("second none to judge")

@@ -142,6 +142,10 @@ def test_drawn_panes_are_taken_where_masks_cannot_tell() -> None:
     other = choose_object_mesh("auto", body, SETTINGS, no_fusion, moved)
     assert other.mesh.source == "hull"
     assert any(what == "drawn panes not taken" for what, _ in other.decisions)
+    unseen = [corners + np.array([0, 0, 1000]) for corners in panes]
+    another = choose_object_mesh("auto", body, SETTINGS, no_fusion, unseen)
+    assert another.mesh.source == "hull", "marks that no view shows keep nothing else from being tried"
+    assert ("drawn panes not taken", "no view has any") in [(what, why[:15]) for what, why in another.decisions]
     with pytest.raises(RtgsError, match="no view has any of the drawn panes"):
         drawn_pane([corners - np.array([0, 50, 0]) for corners in panes], masks.views)
 

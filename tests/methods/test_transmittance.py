@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from glass_cases import GlassScene, ball_mesh, begun, glass_recipe, glass_scene, new_glass_method, train_stages
+from mirror_scene import BALL
 from reflective_cases import schedule
 
 from rtgs.errors import RtgsError
@@ -195,6 +196,13 @@ def test_a_pane_has_no_second_bounce_and_a_set_behind_it():
     assert layers is not None
     assert layers.transmission is not None
     assert float(layers.transmission.abs().max()) == 0
+    whole = new_glass_method(glass_recipe(), flat)
+    for stage in whole.stages[:2]:
+        whole.begin(stage)
+    with torch.no_grad():  # a base set that lies behind the pane as a whole: just beyond the ball's middle
+        whole.base.surfels.means.copy_((BALL + 0.01 * (BALL - cameras[0].center)).expand_as(whole.base.surfels.means))
+    (_, event) = whole.begin(whole.stages[2])
+    assert event.detail == f"copies of {before} base surfels behind the pane"
     random = begun(glass_recipe(split=False), flat)
     assert random.transmittance is not None
     assert len(random.transmittance) == 3**3 * 4
