@@ -27,6 +27,7 @@ WHERE = {"specular": "on specular objects", "masked": "in the masks"}
 LAYERS = {"reflection": "reflected layer", "transmission": "transmitted layer"}
 TIMES_THE_SPREAD = 2.0  # a gain counts above this multiple of its spread
 WORSE = 0.1  # dB over all pixels that a method may lose
+_DIFFERENCES = 3  # told of a run of another recipe
 
 
 @dataclass(frozen=True)
@@ -145,6 +146,8 @@ def summary(found: Sequence[Verdict], against: str) -> list[str]:
         wins, losses = sum(bool(one.beats) for one in judged), [one.scene for one in own if one.not_worse is False]
         won = f"beats {against} on {wins} of {len(judged)} scenes" if judged else "its gain cannot be judged, no spread"
         worse = f"worse than {WORSE} dB overall on {', '.join(losses)}" if losses else f"nowhere worse than {WORSE} dB"
+        if unknown := [one.scene for one in own if one.not_worse is None]:
+            worse += f" (not known on {', '.join(unknown)})"
         lines.append(f"{method}: {won}; {worse}")
     return lines
 
@@ -206,12 +209,38 @@ def collect(scene: str, method: str, arguments: argparse.Namespace, failures: li
             path = finish(job, arguments)
         elif not Path(path).is_file():
             path = "not run yet"
+        elif other := another_recipe(Path(path).parent, job.words(arguments)):
+            path = f"of another recipe than this preset and --set now are ({other})"
         if isinstance(path, str):
             failures.append(f"{scene}, {method}, seed {seed}: {path}")
             print(failures[-1], file=sys.stderr, flush=True)
         else:
             runs.append(read_run(path, seed))
     return tuple(runs)
+
+
+def another_recipe(folder: Path, words: Sequence[str]) -> str:
+    """Where the config of a finished run is another one than ``words`` compose, presets having changed or other words
+    having been given; empty where it is the same. Keys that came later have their defaults."""
+    import yaml
+
+    from rtgs.config.build import build
+    from rtgs.config.compose import compose
+    from rtgs.errors import RtgsError
+    from rtgs.pipeline.fingerprint import flatten, recipe_params
+
+    config = compose(list(words))[0]
+    kept = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
+    found = []
+    for name, wanted in {"method": config.method, "schedule": config.schedule, "scene": config.scene}.items():
+        try:
+            made = flatten(recipe_params(build(type(wanted), kept[name])), name)
+        except (RtgsError, ValueError) as error:
+            return str(error)
+        asked = flatten(recipe_params(wanted), name)
+        found += [f"{key}: {made[key]} -> {asked[key]}" for key in asked if made[key] != asked[key]]
+    rest = len(found) - _DIFFERENCES
+    return ", ".join(found[:_DIFFERENCES]) + (f" and {rest} more" if rest > 0 else "")
 
 
 def measure(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -288,7 +317,7 @@ def parse() -> argparse.Namespace:
     add("--against", default="2dgs", help="the reference, METHOD or METHOD+ABLATION (default: %(default)s)")
     add("--where", choices=list(WHERE), default="specular", help="pixels judged besides all (default: %(default)s)")
     add("--more-seeds", nargs="*", default=[], metavar="SCENE=0,1,2", help="the seeds of single scenes")
-    add("--finished", action="store_true", help="run nothing: read what ROOT/runs holds")
+    add("--finished", action="store_true", help="run nothing: read what ROOT/runs holds of this recipe")
     add("--out", type=Path, help="Markdown file (default: ROOT/paired-PRESET.md)")
     arguments = parser.parse_args()
     arguments.scenes = arguments.scenes or scenes_here()

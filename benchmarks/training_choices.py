@@ -3,8 +3,9 @@
 ``python -m benchmarks.training_choices --scenes toycar --methods 2dgs 3dgs --also "schedule.opacity_reset_every=2000"``
 
 Every eighth view of the training split is held out and judged; test views are never looked at. The first choice is the
-preset as it is, each ``--also`` one more. Each run is a process of its own. A Markdown table grows on the screen, last
-line: a JSON object.
+preset as it is, each ``--also`` one more. The third stage, which needs an object's mesh, is left out: of scenes with
+glass the first two are judged. Each run is a process of its own. A Markdown table grows on the screen, last line: a
+JSON object.
 """
 
 from __future__ import annotations

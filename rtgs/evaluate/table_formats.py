@@ -81,7 +81,7 @@ def notes(table: PaperTable) -> tuple[str, ...]:
         fewer = f" ({seeds[0]} where runs are missing)" if len(seeds) > 1 else ""
         found.append(f"Mean ± sample standard deviation over {max(seeds)} seeds{fewer}; smaller differences are noise.")
     else:
-        found.append("One seed: differences of a few hundredths of a dB are noise.")
+        found.append("One seed: the spread is not known; differences of a few tenths of a dB may be noise.")
     if len(cells) < len(table.methods) * len(table.scenes):
         found.append("Empty cells: the run failed, or was not asked for.")
     absent = [metric.title for metric in QUALITY if all(cell.values[metric.key] is None for cell in cells)]

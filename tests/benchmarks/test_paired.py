@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -60,6 +61,12 @@ def test_verdicts_follow_the_spread_and_borrow_it():
     assert second == "envgs: its gain cannot be judged, no spread; nowhere worse than 0.1 dB"
 
 
+def test_what_is_not_known_is_no_success():
+    without = tuple(replace(run, views={"a": {"psnr_specular": 20.0}}) for run in runs({0: 0.0}))
+    (line,) = summary(verdicts([Entry("toycar", "rtgs", without, without)], "specular"), "2dgs")
+    assert line.endswith("nowhere worse than 0.1 dB (not known on toycar)")
+
+
 def test_unequal_runs_are_not_paired():
     with pytest.raises(ValueError, match="200 steps against 100"):
         Entry("toycar", "rtgs", runs({0: 1.0}, steps=200), runs({0: 0.0})).gains("psnr")
@@ -97,4 +104,7 @@ def test_through_the_pipeline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, c
     text = (tmp_path / "paired-smoke.md").read_text(encoding="utf-8")
     assert text.startswith("`python -m benchmarks.paired --preset smoke --against 2dgs --where specular")
     assert "| reflected layer | scaled |" in text
-    assert main("--finished")["figures"] == figures["figures"], "read again, nothing measured"
+    assert main("--finished", "--set", *tiny)["figures"] == figures["figures"], "read again, nothing measured"
+    other = main("--finished", "--set", *tiny[1:])
+    assert other["figures"] == []
+    assert all("of another recipe" in one and "schedule.total: 12 -> " in one for one in other["failures"])
