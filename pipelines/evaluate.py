@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.extract_mesh import SUMMARY_FILE
+from pipelines.extract_mesh import SUMMARY_FILE, why_absent
 from pipelines.render import read_timed
 from pipelines.training import last_training, read_summary
 from rtgs.config.schema import EvaluationConfig
@@ -80,13 +80,16 @@ def evaluate(params: EvaluateParams, context: StepContext) -> None:
         context.tracker.metrics({f"object/{name}": value for name, value in known.numbers().items()})
 
 
-def object_facts(folder: Path, scene: Scene) -> ObjectFacts:
-    """What is known of the object mesh in an artifact of ``extract_mesh``, with the guide's fallbacks counted."""
+def object_facts(folder: Path, scene: Scene) -> ObjectFacts | None:
+    """What is known of the object mesh in an artifact of ``extract_mesh``, with the guide's fallbacks counted; None:
+    there is no such object."""
     from rtgs.evaluate.surface import ObjectFacts, hit_shares
     from rtgs.mesh.container import ObjectGuide, read_object_mesh
     from rtgs.mesh.score import container_mesh
     from rtgs.mesh.silhouettes import bounding
 
+    if why_absent(folder):
+        return None
     mesh, record = read_object_mesh(folder), json.loads((folder / SUMMARY_FILE).read_text(encoding="utf-8"))
     guide, truth, distance = ObjectGuide(mesh, cache_views=0), record.get("truth") or {}, None
     if truth and (container := container_mesh(scene.name)) is not None:

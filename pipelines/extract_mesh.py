@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 MESH_FILE = "mesh.ply"
 PICTURE_FILE = "mesh.png"
 SUMMARY_FILE = "mesh.json"
+ABSENT = "absent"  # in it, instead of a mesh: why there is no transparent object
 
 
 @dataclass(frozen=True)
@@ -67,14 +68,21 @@ def object_params(config: RunConfig) -> ExtractMeshParams:
 
 def extract_mesh(params: ExtractMeshParams, context: StepContext) -> None:
     """Write ``mesh.ply``, ``mesh.json`` (counts, lengths, scores, decisions) and ``mesh.png`` (seen from a test view,
-    else a training view). With a ``source``: the artifact :func:`rtgs.mesh.container.read_object_mesh` reads.
+    else a training view). With a ``source``: the artifact :func:`rtgs.mesh.container.read_object_mesh` reads, or, where
+    no mask shows an object (masks that a step makes are known only now), ``mesh.json`` alone: :func:`why_absent`.
 
     Raises:
         RtgsError: no depth to fuse, masks are asked for and the scene has none, or no object mesh can be made.
     """
+    from rtgs.mesh.silhouettes import why_unbounded
     from rtgs.scenes.canonical import read_scene
 
     scene = read_scene(context.inputs["import_scene"])
+    if params.source and params.only_masked and (why := why_unbounded([view.mask for view in scene.train])):
+        record = {ABSENT: why, "decisions": [["no transmittance stage", why]]}
+        (context.out / SUMMARY_FILE).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+        context.log.info("no mesh of a transparent object: %s", why)
+        return
     if params.only_masked and all(view.mask is None for view in scene.train):
         raise RtgsError(f"scene {scene.name!r} has no masks, but the mesh is to be made of masked pixels only")
     method, stage = load_method(last_training(context.inputs), scene)
@@ -82,6 +90,11 @@ def extract_mesh(params: ExtractMeshParams, context: StepContext) -> None:
         _object_mesh(method, stage.until, scene, params, context)
     else:
         _scene_mesh(method, stage.until, scene, params, context)
+
+
+def why_absent(folder: Path) -> str:
+    """Why an artifact of this step holds no mesh of the transparent object; empty: it holds one."""
+    return json.loads((folder / SUMMARY_FILE).read_text(encoding="utf-8")).get(ABSENT, "")
 
 
 def _scene_mesh(method: Method, step: int, scene: Scene, params: ExtractMeshParams, context: StepContext) -> None:
@@ -108,14 +121,40 @@ def _object_mesh(method: Method, step: int, scene: Scene, params: ExtractMeshPar
     """Of the transparent object: hull, pane, TSDF or a given file."""
     import numpy as np
 
-    from rtgs.mesh.choose import choose_object_mesh
     from rtgs.mesh.container import write_object_mesh
-    from rtgs.mesh.silhouettes import mask_set
-    from rtgs.mesh.tsdf import fuse_depths, object_fusion
     from rtgs.prepare.masks_report import MaskReport
 
-    made: list[MeshResult] = []
     drawn = "masks" in context.inputs  # of a scene whose panes somebody drew
+    panes = [np.array(pane.corners) for pane in MaskReport.read(context.inputs["masks"]).panes] if drawn else []
+    choice, fused = find_object_mesh(method, step, scene, params, panes)
+    record = _choice_record(choice) | _pictured(choice.mesh.mesh, scene, params, context.out)
+    if choice.mesh.source == "tsdf":
+        assert fused is not None
+        record |= _fusion_record(fused)
+    truth = _against_truth(choice, scene)
+    write_object_mesh(context.out, choice.mesh, record | {"truth": truth})
+    for what, why in choice.decisions:
+        context.log.info("%s: %s", what, why)
+    numbers = {"silhouette_iou": choice.iou.mean, "silhouette_iou_lowest": choice.iou.lowest}
+    numbers |= {"silhouette_iou_all_pixels": choice.iou_all.mean} | truth
+    numbers |= {f"silhouette_iou_{name}": value for name, value in choice.candidates.items()}
+    context.tracker.metrics({f"mesh/{name}": value for name, value in numbers.items()} | _sizes(choice.mesh.mesh))
+
+
+def find_object_mesh(
+    method: Method, step: int, scene: Scene, params: ExtractMeshParams, panes: Sequence[np.ndarray] = ()
+) -> tuple[Choice, MeshResult | None]:
+    """The mesh of the transparent object from the masks of the training views and the base set's depth after ``step``,
+    and the fusion of depths if one was made. ``panes``: flat polygons (K, 3) that somebody drew, world frame.
+
+    Raises:
+        RtgsError: no mask shows an object, or no mesh can be made.
+    """
+    from rtgs.mesh.choose import choose_object_mesh
+    from rtgs.mesh.silhouettes import mask_set
+    from rtgs.mesh.tsdf import fuse_depths, object_fusion
+
+    made: list[MeshResult] = []
     cameras = [view.camera for view in scene.train]
 
     def fuse(box: np.ndarray | None) -> tuple[TriangleMesh, float]:
@@ -127,19 +166,8 @@ def _object_mesh(method: Method, step: int, scene: Scene, params: ExtractMeshPar
         return made[-1].mesh, made[-1].voxel
 
     masks = mask_set(cameras, [view.mask for view in scene.train], _median_depths(method, step, scene))
-    panes = [np.array(pane.corners) for pane in MaskReport.read(context.inputs["masks"]).panes] if drawn else []
     choice = choose_object_mesh(params.source, masks, params.object, fuse, panes)
-    record = _choice_record(choice) | _pictured(choice.mesh.mesh, scene, params, context.out)
-    if choice.mesh.source == "tsdf":
-        record |= _fusion_record(made[-1])
-    truth = _against_truth(choice, scene)
-    write_object_mesh(context.out, choice.mesh, record | {"truth": truth})
-    for what, why in choice.decisions:
-        context.log.info("%s: %s", what, why)
-    numbers = {"silhouette_iou": choice.iou.mean, "silhouette_iou_lowest": choice.iou.lowest}
-    numbers |= {"silhouette_iou_all_pixels": choice.iou_all.mean} | truth
-    numbers |= {f"silhouette_iou_{name}": value for name, value in choice.candidates.items()}
-    context.tracker.metrics({f"mesh/{name}": value for name, value in numbers.items()} | _sizes(choice.mesh.mesh))
+    return choice, made[-1] if made else None
 
 
 def _choice_record(choice: Choice) -> dict[str, object]:

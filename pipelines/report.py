@@ -162,12 +162,15 @@ def _mesh_decisions(inputs: Mapping[str, Path]) -> list[Decision]:
     return [Decision(what, why) for what, why in record.get("decisions", [])]
 
 
-def _mesh(folder: Path) -> MeshFigure:
+def _mesh(folder: Path) -> MeshFigure | None:
+    """None: the scene turned out to have no transparent object."""
     import numpy as np
     from PIL import Image
 
     from rtgs.report.page import MeshFigure
 
+    if extract_mesh.why_absent(folder):
+        return None
     record = json.loads((folder / extract_mesh.SUMMARY_FILE).read_text(encoding="utf-8"))
     pixels = np.asarray(Image.open(folder / extract_mesh.PICTURE_FILE).convert("RGB"))
     note = f"{record['note']} Seen from {record['picture_from']}."

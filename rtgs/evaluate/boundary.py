@@ -11,6 +11,7 @@ from torch import Tensor
 
 from rtgs.evaluate.surface import DEPTH_TOLERANCE, NORMAL_TOLERANCE, surface_errors
 from rtgs.mesh.container import ObjectGuide, ObjectMesh
+from rtgs.mesh.silhouettes import bounding
 from rtgs.methods.base import RenderedView, RenderOptions
 from rtgs.train.losses import surface_depth
 
@@ -25,7 +26,7 @@ RENDERED_VIEWS = 12  # about so many training views are rendered for their k_s
 class BoundaryScores:
     """Shares are of masked pixels, over the test views with truth; None: no test view has truth and a mask."""
 
-    silhouette_iou: float | None  # of the mesh with the masks of the training views; None: no masks
+    silhouette_iou: float | None  # of the mesh with those masks of the training views that bound something; None: none
     depth_share: float | None  # rasterised first surface within 3 % of the truth
     normal_share: float | None  # rasterised normal within 15 degrees of the truth
     normal_degrees: float | None  # median angle to the true normal
@@ -49,7 +50,7 @@ def boundary_scores(method: Method, scene: Scene, mesh: ObjectMesh, step: int) -
     guide = ObjectGuide(mesh)
     common = whole = 0
     weights = pixels = 0.0
-    masked = [(view, view.mask) for view in scene.train if view.mask is not None]
+    masked = [(view, mask) for view in scene.train if (mask := bounding(view.mask)) is not None]
     for index, (view, mask) in enumerate(masked):
         hit = guide.surfaces(view.camera).hit
         common, whole = common + int((hit & mask).sum()), whole + int((hit | mask).sum())

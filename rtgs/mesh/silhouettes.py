@@ -78,13 +78,19 @@ def mask_set(
         if 0 < share < COVERED:
             views.append(MaskView(camera, mask.bool(), None if depths is None else depths[index]))
     if not views:
-        why = "there are no masks"
-        if full:
-            why = f"{full} masks cover the whole picture and {empty} are empty: nothing tells object from scene"
-        elif empty:
-            why = f"all {empty} masks are empty"
-        raise RtgsError(f"no view shows where the transparent object is: {why}")
+        raise RtgsError(f"no view shows where the transparent object is: {why_unbounded(masks)}")
     return MaskSet(tuple(views), without, empty, full)
+
+
+def why_unbounded(masks: Sequence[Tensor | None]) -> str:
+    """Why none of the masks (H, W) bool tells object from scene; empty: at least one does."""
+    shares = [float(mask.float().mean()) for mask in masks if mask is not None]
+    if any(0 < share < COVERED for share in shares):
+        return ""
+    empty = shares.count(0.0)
+    if full := len(shares) - empty:
+        return f"{full} masks cover the whole picture and {empty} are empty: nothing tells object from scene"
+    return f"all {empty} masks are empty" if empty else "there are no masks"
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
+from pipelines import evaluate, report
 from pipelines import extract_mesh as step
 from rtgs.cameras import Camera
 from rtgs.config.schema import MeshConfig, RunConfig
@@ -124,14 +125,24 @@ def test_mesh_of_the_transparent_object(context: StepContext, source: str) -> No
     assert (context.out / "mesh.obj").is_file()
 
 
-def test_object_mesh_without_any_mask_is_explained(context: StepContext) -> None:
-    with pytest.raises(RtgsError, match="has no masks"):
-        step.extract_mesh(replace(PARAMS, only_masked=True, source="auto"), context)
-    everything = sphere_scene(masked=True)
-    train = tuple(replace(view, mask=torch.ones_like(view.image[0], dtype=torch.bool)) for view in everything.train)
-    save_scene(replace(everything, train=train), context.inputs["import_scene"])
-    with pytest.raises(RtgsError, match="cover the whole picture"):
-        step.extract_mesh(replace(PARAMS, only_masked=True, source="auto"), context)
+def test_without_a_mask_that_shows_something_there_is_no_object_and_no_error(context: StepContext) -> None:
+    """A step that makes masks may find nothing: the run goes on, and whoever reads the artifact is told."""
+    params = replace(PARAMS, only_masked=True, source="auto")
+    step.extract_mesh(params, context)
+    assert step.why_absent(context.out) == "there are no masks"
+    assert [path.name for path in context.out.iterdir()] == ["mesh.json"]
+    blank = sphere_scene(masked=True)
+    for fill, why in ((0, "all 12 masks are empty"), (1, "12 masks cover the whole picture")):
+        train = tuple(replace(view, mask=torch.full((80, 96), bool(fill))) for view in blank.train)
+        save_scene(replace(blank, train=train), context.inputs["import_scene"])
+        step.extract_mesh(params, context)
+        assert why in step.why_absent(context.out)
+    assert evaluate.object_facts(context.out, blank) is None
+    assert report._mesh(context.out) is None
+    assert report._mesh_decisions({"extract_mesh": context.out})[0].what == "no transmittance stage"
+    save_scene(whole_masks(sphere_scene(masked=False)), context.inputs["import_scene"])
+    step.extract_mesh(replace(params, object=ObjectSettings(hull=HullSettings(voxels=24))), context)
+    assert step.why_absent(context.out) == ""
 
 
 def test_an_empty_mesh_is_an_error_and_nothing_is_written(context: StepContext, tmp_path: Path) -> None:

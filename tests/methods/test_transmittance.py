@@ -14,6 +14,7 @@ from reflective_cases import schedule
 from rtgs.errors import RtgsError
 from rtgs.evaluate.boundary import boundary_scores
 from rtgs.gaussians.density import logit
+from rtgs.mesh.triangles import TriangleMesh
 from rtgs.methods import RenderOptions, Stage, create_method, method_stages
 from rtgs.methods.interface_set import normal_quaternions
 from rtgs.methods.transmittance_set import random_surfels
@@ -221,6 +222,36 @@ def test_every_parameter_learns_and_nothing_resets_the_base(made: GlassScene):
             assert float(moment.max()) > 0, f"{part.name}.{name}"
     events = [event for step in range(30, 59) for event in _events_of(method, step)]
     assert not [event for event in events if event.set_name == "base"]
+    assert {event.kind for event in events if event.set_name == "transmittance"} == {"density", "opacity_reset"}
+    assert not [event for event in events if event.set_name == "interface"]
+
+
+def test_the_losses_of_glass_start_at_their_steps(made: GlassScene):
+    recipe = glass_recipe()
+    method = begun(replace(recipe, loss=replace(recipe.loss, specular_start=0.6)), made)
+    view = made.scene.train[0]
+
+    def names(step: int) -> set[str]:
+        rendered = method.render(view.camera, step, None, view.mask)
+        return {term.name for term in method.losses(rendered, view, step).terms}
+
+    found = [names(step) & {"specular", "transmission_depth"} for step in (35, 36, 44, 45)]
+    assert found == [set(), {"specular"}, {"specular"}, {"specular", "transmission_depth"}]
+    assert "interface_normal" in names(35)
+
+
+def test_a_mesh_with_a_hole_trains(made: GlassScene):
+    """Rays through it meet the far wall first: one surface, a thin sheet there."""
+    whole = made.mesh.mesh
+    faces = whole.faces[(whole.vertices[whole.faces][:, :, 2] > whole.vertices[:, 2].min() + 0.4).any(1)]
+    assert 0 < len(faces) < len(whole.faces)
+    holed = GlassScene(made.scene, replace(made.mesh, mesh=TriangleMesh(whole.vertices, faces)))
+    method = new_glass_method(glass_recipe(), holed, schedule(total=24, checkpoint_every=100))
+    train_stages(method, made.scene)
+    assert method.guide is not None
+    assert method.guide.counts()["one_hit"] > 0
+    for part in method.sets:
+        assert all(bool(torch.isfinite(tensor).all()) for _, tensor in part.surfels.items()), part.name
 
 
 def _events_of(method, step: int):

@@ -14,7 +14,8 @@ from PIL import Image
 from test_app import QUICK, _in_root, root  # noqa: F401  (fixtures)
 
 from pipelines.cli import main
-from pipelines.graph import build_graph
+from pipelines.evaluate import TRACKED
+from pipelines.graph import RunGraph, build_graph
 from pipelines.train_transmittance import BOUNDARY_FILE
 from pipelines.training import OBJECT_FOLDER, load_method, stage_params
 from rtgs.config import compose
@@ -33,6 +34,7 @@ TINY = (
     "method.loss.perceptual=0",
     "evaluation.lpips=false",
 )
+TRACKED_QUICK = ("tracking=jsonl", *(word for word in QUICK if word != "tracking=off"))
 RADIUS, DISTANCE, FOCAL = 0.7, 3.0, 30.0
 
 
@@ -91,15 +93,51 @@ def test_only_scenes_with_masks_that_show_something_get_the_third_stage(glass: P
         ("empty", "all 14 masks of the scene are empty"),
         ("full", "14 of 14 masks cover the whole picture"),
     ):
-        without = graph_of(write_capture(tmp_path / masks, masks))
+        without_glass = write_capture(tmp_path / masks, masks)
+        without = graph_of(without_glass)
         assert [step.name for step in without.training] == ["train_diffuse", "train_reflection"]
         assert without.mesh is None
         assert without.training[-1].params.until == 12
         assert any(step.name == "train_transmittance" and why in step.why for step in without.skipped)
+        _same_run(without, graph_of(without_glass, "ablation=two_stages"))
     two = graph_of(glass, "ablation=two_stages")
     assert [step.name for step in two.training] == ["train_diffuse", "train_reflection"]
     assert two.training[-1].params.until == 12
     assert not any(step.name == "train_transmittance" for step in graph_of(glass, "method=2dgs").skipped)
+
+
+def _same_run(run: RunGraph, two_stages: RunGraph) -> None:
+    """Both are the very same steps up to the pictures: the third stage does no harm where there is nothing for it."""
+    ours, theirs = ((*graph.training, graph.render) for graph in (run, two_stages))
+    assert [step.fingerprint for step in ours] == [step.fingerprint for step in theirs]
+
+
+@pytest.mark.parametrize("preset", ["quick", "standard"])
+@pytest.mark.parametrize("scene", ["matte_room", "spheres"])
+def test_shipped_scenes_without_glass_are_trained_as_if_there_were_no_third_stage(scene: str, preset: str):
+    words = [f"scene={scene}", "method=rtgs", f"preset={preset}"]
+    run, two_stages = (build_graph(*compose([*words, *more])) for more in ([], ["ablation=two_stages"]))
+    _same_run(run, two_stages)
+    assert run.mesh is None
+
+
+def test_masks_that_a_step_makes_and_that_are_empty_change_nothing(root: Path, tmp_path: Path):  # noqa: F811
+    """Known only when it has run: mesh and third stage are planned, and what they leave is the two-stage run."""
+    capture = write_capture(tmp_path / "plain ball", "empty")
+    words = ["run", f"scene={capture}", "method=rtgs", "masks=given", *QUICK, *TINY]
+    words.append("method.reflection.matte.probation=0")
+    assert main([*words, "name=three"]) == 0
+    assert main([*words, "name=two", "ablation=two_stages"]) == 0
+    three, two = root / "runs" / "three", root / "runs" / "two"
+    assert "train_transmittance" in json.loads((three / "run.json").read_text())["steps"]
+    for name in ("point_cloud.ply", "reflection.ply", *(f"renders/{path.name}" for path in two.glob("renders/*"))):
+        assert (three / name).read_bytes() == (two / name).read_bytes(), name
+    found = [json.loads((folder / "metrics.json").read_text()) for folder in (three, two)]
+    assert found[0]["mean"]["psnr"] == found[1]["mean"]["psnr"]
+    assert found[0]["object"] is None
+    page = (three / "report.html").read_text()
+    assert "no transmittance stage" in page
+    assert "there are no masks" in page
 
 
 def test_the_mesh_takes_the_planes_that_somebody_drew(tmp_path: Path):
@@ -135,7 +173,7 @@ def test_the_rows_of_table_3_share_everything_before_the_third_stage(glass: Path
 
 def test_table_3_runs_each_shared_step_once_and_nothing_twice(root: Path, glass: Path, capsys):  # noqa: F811
     """The paper's five rows: one first, one second, one mesh, five third stages; our sixth: one mesh, one stage."""
-    words = ["run", "experiment=table3", "hydra/launcher=basic", f"scene={glass}", *QUICK, *TINY]
+    words = ["run", "experiment=table3", "hydra/launcher=basic", f"scene={glass}", *TRACKED_QUICK, *TINY]
     assert main(words) == 0
     store = root / "store"
 
@@ -152,8 +190,10 @@ def test_table_3_runs_each_shared_step_once_and_nothing_twice(root: Path, glass:
     assert capsys.readouterr().err.count("nothing to do") == len(ROWS) + 1
     assert before == {path: (path / "manifest.json").stat().st_mtime_ns for path in made("*")}
     with (root / "tables" / "table3-smoke" / "table.csv").open(encoding="utf-8") as stream:
-        rows = [row["method"] for row in csv.DictReader(stream)]
-    assert rows == ["rtgs", *(f"rtgs, {name}" for name in (*ROWS[1:], "mesh_tsdf"))]
+        rows = list(csv.DictReader(stream))
+    assert [row["method"] for row in rows] == ["rtgs", *(f"rtgs, {name}" for name in (*ROWS[1:], "mesh_tsdf"))]
+    assert all(row[name] for row in rows for name in ("psnr_masked", "ssim_masked", "object_silhouette_iou"))
+    _the_transparent_part_is_tracked(root)
     _artifacts_are_complete(store, third)
     page = (root / "runs" / "glass_ball-rtgs-smoke" / "report.html").read_text()
     assert "Transmission" in page
@@ -165,6 +205,18 @@ def test_table_3_runs_each_shared_step_once_and_nothing_twice(root: Path, glass:
     assert 0 <= table["object"]["no_hit"] < 0.5, "the guide's fallbacks are counted"
     assert "rays without two surfaces" in page
     assert "meet one surface only" in page
+
+
+def _the_transparent_part_is_tracked(folder: Path) -> None:
+    """What the tables hold of it, and what is measured at the stage's boundaries."""
+    lines = (line for file in folder.rglob("events.jsonl") for line in file.read_text().splitlines())
+    found = {name for line in lines for name in json.loads(line).get("values", {})}
+    wanted = {f"eval/{name}" for name in ("psnr_masked", "ssim_masked", "psnr_masked_given_masks")}
+    wanted |= {"object/silhouette_iou", "object/one_hit", "object/no_hit", "mesh/silhouette_iou"}
+    wanted |= {f"boundary/{when}/silhouette_iou" for when in ("before", "after")}
+    assert wanted <= found
+    of_truth = {f"psnr_{layer}{scaled}" for layer in ("reflection", "transmission") for scaled in ("", "_scaled")}
+    assert {*of_truth, "depth_share_masked", "normal_degrees_masked"} <= {*TRACKED}
 
 
 def _artifacts_are_complete(store: Path, third: list[Path]) -> None:

@@ -1,4 +1,4 @@
-"""When the second stage does what: EnvGS's schedule at its own length, and scaled."""
+"""When the second and the third stage do what: the published schedules at their own length, and scaled."""
 
 from __future__ import annotations
 
@@ -11,12 +11,14 @@ from rtgs.train.schedule import (
     base_densify_due,
     base_reset_due,
     densify_due,
+    loss_start,
     opacities_held,
     opacity_reset_due,
     propagation_due,
     reflection_plan,
     reflection_reset_due,
     sh_degree_at,
+    transmittance_plan,
 )
 from rtgs.train.settings import ReflectionSettings
 from rtgs.train.specular_settings import MatteSettings, PropagationSettings
@@ -48,6 +50,25 @@ def test_the_papers_boundaries():
     assert base_densify_due(plan, settings, 18100)
     assert sh_degree_at(plan.reflection, 2999, 3) == 0
     assert sh_degree_at(plan.reflection, 4000, 3) == 1
+
+
+def test_the_papers_third_stage_has_a_clock_of_its_own_and_freezes_the_base():
+    """methods.md 6.2: from 20,000 of 60,000; the base set's density control and resets end there."""
+    config, _ = compose(["scene=demo", "method=rtgs", "preset=paper", "schedule.densify_until=30000"])
+    settings, schedule, loss = config.method.transmittance, config.schedule, config.method.loss
+    plan = transmittance_plan(settings, schedule)
+    assert (plan.start, plan.clock(20500), plan.own.total, plan.own.means_lr_steps) == (20000, 500, 40000, 30000)
+    clock = range(0, 40000, 100)
+    assert [own for own in clock if densify_due(plan.own, own)] == list(range(1000, 20000, 500))
+    assert [own for own in clock if opacity_reset_due(plan.own, own)] == [6000, 12000, 18000]
+    assert [sh_degree_at(plan.own, own, 3) for own in (999, 1000, 2999, 9000)] == [0, 1, 2, 3]
+    late = range(20000, 60000, 100)
+    assert not any(densify_due(plan.base, step) or opacity_reset_due(plan.base, step) for step in late)
+    growing = transmittance_plan(replace(settings, freeze_base=False), schedule).base
+    assert [step for step in late if opacity_reset_due(growing, step)] == [21000, 24000, 27000]
+    assert reflection_plan(config.method.reflection, plan.base).reflection.densify_until == 21000, "E goes on"
+    starts = (loss.specular_start, loss.perceptual_start, loss.transmission_depth_start)
+    assert [loss_start(share, schedule.total) for share in starts] == [20000, 21000, 40000]
 
 
 def test_opacities_stand_still_from_a_propagation_to_the_next_multiple_of_200():
