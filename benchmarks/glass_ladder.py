@@ -89,6 +89,9 @@ LADDER: dict[str, Rung] = {
     "hull_fixed": Rung("hull, its normals held fixed", _hull(f"{_T}.normal=mesh")),
     "tsdf": Rung("TSDF of the base set", lambda *_: ["ablation=mesh_tsdf"]),
     "two_stages": Rung("no third stage", lambda *_: ["ablation=two_stages"]),
+    "paper_truth_mesh": Rung(
+        "the paper's way, the true mesh for box and back", lambda s, _: ["ablation=paper_glass", *_given(s)]
+    ),
     "paper": Rung("the paper's way: full second stage, no interface, TSDF", _paper()),
     "paper_propagation": Rung("the paper's way, normal propagation", lambda _, c: _paper()(_, c) + _propagation(c)),
     "paper_early_specular": Rung(

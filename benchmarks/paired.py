@@ -137,14 +137,16 @@ def verdicts(entries: Sequence[Entry], where: str) -> list[Verdict]:
     return found
 
 
-def summary(found: Sequence[Verdict], against: str) -> list[str]:
-    """For each method: on how many scenes it wins, and whether it loses anywhere."""
+def summary(found: Sequence[Verdict], against: str, where: str) -> list[str]:
+    """For each method: on how many scenes it wins, by how much on average, and whether it loses anywhere."""
     lines = []
     for method in dict.fromkeys(verdict.method for verdict in found):
         own = [verdict for verdict in found if verdict.method == method]
         judged = [one for one in own if one.beats is not None]
         wins, losses = sum(bool(one.beats) for one in judged), [one.scene for one in own if one.not_worse is False]
         won = f"beats {against} on {wins} of {len(judged)} scenes" if judged else "its gain cannot be judged, no spread"
+        gains = [one.gain for one in own if one.gain is not None]
+        won += f", by {statistics.fmean(gains):+.2f} dB {where} on average over {len(gains)}" if gains else ""
         worse = f"worse than {WORSE} dB overall on {', '.join(losses)}" if losses else f"nowhere worse than {WORSE} dB"
         if unknown := [one.scene for one in own if one.not_worse is None]:
             worse += f" (not known on {', '.join(unknown)})"
@@ -195,7 +197,7 @@ def markdown(entries: Sequence[Entry], arguments: argparse.Namespace) -> str:
     heads = ["scene", "method", *(head for head, _, _ in chosen), "train CPU s", "Gaussians", "seeds"]
     found = verdicts(entries, arguments.where)
     lines = [verdict.sentence(arguments.against, WHERE[arguments.where]) for verdict in found]
-    said = "".join(f"- {line}\n" for line in (*lines, *summary(found, arguments.against)))
+    said = "".join(f"- {line}\n" for line in (*lines, *summary(found, arguments.against, WHERE[arguments.where])))
     return f"{table([row(entry, chosen) for entry in entries], heads)}\n{said}"
 
 

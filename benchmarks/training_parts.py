@@ -4,7 +4,8 @@ The whole training runs, every stage, as ``rtgs run`` would train it, with a clo
 rasteriser, the tracer, its tree, activation of parameters, losses, Adam, density control. What is left is ``shading``:
 pixels to rays, microfacet weights, blend, autograd, the loop. ``fixed``: how much of all is Python and calls, by a step
 on a picture 16 pixels wide and some hundred surfels. A part's clock stops while a part inside of it runs, so shares add
-up to 1. Seconds are CPU seconds of one thread; with ``--threads 2`` wall seconds. The third stage is left out.
+up to 1. Seconds are CPU seconds of one thread; with ``--threads 2`` wall seconds. Where the scene's masks show a
+transparent object its mesh is made before the third stage, as the pipeline makes it; its time counts in the whole.
 A Markdown table, then a JSON object as the last line.
 """
 
@@ -26,9 +27,12 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from benchmarks.machine import machine
 from benchmarks.training_runs import schedule_overrides
 
 if TYPE_CHECKING:
+    from rtgs.config.schema import RunConfig
+    from rtgs.mesh.container import ObjectMesh
     from rtgs.methods import Method, Stage
     from rtgs.scenes.scene import Scene
 
@@ -47,9 +51,25 @@ class StageShares:
     preset_steps: int  # of this stage when the schedule is not shrunk
     shares: dict[str, float]  # by part; they add up to 1
     fixed: float  # share of what a step costs without pixels and surfels; contained in the others
-    rays: float  # mean number of mirror rays a step
-    hits: float  # mean number of hits a mirror ray
+    rays: float  # mean number of rays a step: mirror rays, in the third stage straight ones too
+    hits: float  # mean number of hits a ray
     surfels: dict[str, int]  # by set, at the end
+
+
+@dataclass(frozen=True)
+class Training:
+    """A whole one."""
+
+    stages: tuple[StageShares, ...]
+    mesh_seconds: float = 0.0  # of the transparent object's mesh, by the clock of the benchmark
+    mesh_cpu_seconds: float = 0.0
+
+    def minutes(self) -> tuple[float, float]:
+        """By the clock of the benchmark, and CPU minutes of all threads, of the training as the preset has it."""
+        scale = [stage.preset_steps / stage.steps for stage in self.stages]
+        by_clock = sum(factor * stage.seconds for factor, stage in zip(scale, self.stages, strict=True))
+        cpu = sum(factor * stage.cpu_seconds for factor, stage in zip(scale, self.stages, strict=True))
+        return (by_clock + self.mesh_seconds) / 60, (cpu + self.mesh_cpu_seconds) / 60
 
 
 class PartClock:
@@ -105,6 +125,7 @@ def clocks(clock: PartClock) -> Iterator[None]:
     from rtgs.methods.surfel_base import SurfelMethod
     from rtgs.methods.surfel_set import SurfelSet
     from rtgs.methods.traced_set import FollowingTree
+    from rtgs.methods.transmittance import TransmissiveMethod
     from rtgs.render import ellipsoids, rasterize, trace
     from rtgs.train import losses
     from rtgs.train.adam import SurfelAdam
@@ -123,6 +144,7 @@ def clocks(clock: PartClock) -> Iterator[None]:
         (FollowingTree, "current", "tree"),
         (SurfelMethod, "losses", "losses"),
         (ReflectiveMethod, "losses", "losses"),
+        (TransmissiveMethod, "losses", "losses"),
         (SurfelAdam, "step", "adam"),
         (SurfelSet, "_clamp", "adam"),
         (SurfelSet, "densify", "density"),
@@ -138,28 +160,32 @@ def clocks(clock: PartClock) -> Iterator[None]:
 
 
 def stage_shares(
-    method: Method, scene: Scene, seed: int, now: Callable[[], float], preset_steps: Sequence[int]
-) -> list[StageShares]:
-    """Train every stage of the method under the clocks; ``preset_steps``: by stage, in the schedule as it is."""
+    method: Method, scene: Scene, seed: int, now: Callable[[], float], stage: Stage, preset_steps: int
+) -> StageShares:
+    """Train one stage of the method under the clocks; ``preset_steps``: in the schedule as it is."""
     from rtgs.train.trainer import Trainer
 
-    found = []
-    for stage, whole in zip(method.stages, preset_steps, strict=True):
-        clock = PartClock(now)
-        trainer = Trainer(method, scene, seed=seed, stage=stage)
-        began = time.process_time()
-        with clocks(clock), clock.part("shading"):
-            trainer.run()
-        spent = time.process_time() - began
-        seconds = sum(clock.seconds.values())
-        steps = stage.until - stage.from_step
-        fixed = steps * fixed_seconds(method, scene, stage, now)
-        shares = {part: clock.seconds[part] / seconds for part in PARTS if clock.seconds[part] > 0}
-        surfels = {part.name: len(part) for part in method.sets}
-        rays, hits = clock.rays / steps, clock.hits / max(clock.rays, 1)
-        timed = (steps, seconds, spent, whole)
-        found.append(StageShares(stage.name, *timed, shares, fixed / seconds, rays, hits, surfels))
-    return found
+    clock = PartClock(now)
+    trainer = Trainer(method, scene, seed=seed, stage=stage)
+    began = time.process_time()
+    with clocks(clock), clock.part("shading"):
+        trainer.run()
+    spent = time.process_time() - began
+    seconds = sum(clock.seconds.values())
+    steps = stage.until - stage.from_step
+    fixed = steps * fixed_seconds(method, scene, stage, now)
+    shares = {part: clock.seconds[part] / seconds for part in PARTS if clock.seconds[part] > 0}
+    surfels = {part.name: len(part) for part in method.sets}
+    rays, hits = clock.rays / steps, clock.hits / max(clock.rays, 1)
+    timed = (steps, seconds, spent, preset_steps)
+    return StageShares(stage.name, *timed, shares, fixed / seconds, rays, hits, surfels)
+
+
+def found_mesh(method: Method, step: int, scene: Scene, config: RunConfig) -> ObjectMesh:
+    """The transparent object's mesh, as the step ``extract_mesh`` of a run finds it."""
+    from pipelines.extract_mesh import find_object_mesh, object_params
+
+    return find_object_mesh(method, step, scene, object_params(config))[0].mesh
 
 
 def fixed_seconds(method: Method, scene: Scene, stage: Stage, now: Callable[[], float]) -> float:
@@ -167,24 +193,32 @@ def fixed_seconds(method: Method, scene: Scene, stage: Stage, now: Callable[[], 
     from rtgs.methods import create_method
     from rtgs.train.seeds import generator_for
 
-    view = scene.train[0]
+    view = next((view for view in scene.train if view.mask is not None and view.mask.any()), scene.train[0])
     height = max(4, round(view.camera.height * SMALL_WIDTH / view.camera.width))
 
     def shrunk(maps: torch.Tensor | None) -> torch.Tensor | None:
         return None if maps is None else maps[..., :height, :SMALL_WIDTH].contiguous()
 
+    guide = getattr(method, "guide", None)
+    mask = None
+    if guide is not None and view.mask is not None:
+        mask = torch.nn.functional.interpolate(view.mask[None, None].float(), (height, SMALL_WIDTH))[0, 0] > 0
     camera = view.camera.resized(SMALL_WIDTH, height)
-    small = replace(view, camera=camera, image=shrunk(view.image), mask=None, normal=shrunk(view.normal))
+    small = replace(view, camera=camera, image=shrunk(view.image), mask=mask, normal=shrunk(view.normal))
     points, colors = scene.points[:SMALL_ROWS], scene.point_colors[:SMALL_ROWS]
     little = replace(scene, train=(small,), test=(), points=points, point_colors=colors)
     settings = replace(method.settings, reflection=replace(method.settings.reflection, cells=3))
-    other = create_method(settings, little, method.schedule, generator_for(0, "initialise"))
+    interface = replace(settings.transmittance.interface, count=min(settings.transmittance.interface.count, SMALL_ROWS))
+    through = replace(settings.transmittance, cells=3, opaque_share=1.0, interface=interface)
+    settings = replace(settings, transmittance=through)
+    mesh = None if guide is None else guide.mesh
+    other = create_method(settings, little, method.schedule, generator_for(0, "initialise"), mesh)
     if len(method.sets) > 1:
         other.begin(stage)
     times = []
     for _ in range(SMALL_STEPS):
         start = now()
-        rendered = other.render(camera, stage.until - 1, None, None)
+        rendered = other.render(camera, stage.until - 1, None, mask)
         other.losses(rendered, small, stage.until - 1).total.backward()
         for part in other.sets:
             part.step(stage.until - 1, 3)
@@ -192,9 +226,10 @@ def fixed_seconds(method: Method, scene: Scene, stage: Stage, now: Callable[[], 
     return median(times)
 
 
-def measure(words: Sequence[str], shrunk: Sequence[str], threads: int) -> list[StageShares]:
-    """Compose, load, train under the clocks; ``shrunk``: the words that shorten the schedule."""
+def measure(words: Sequence[str], shrunk: Sequence[str], threads: int) -> Training:
+    """Compose, load, train under the clocks, every stage; ``shrunk``: the words that shorten the schedule."""
     from rtgs.config.compose import compose
+    from rtgs.mesh.silhouettes import why_unbounded
     from rtgs.methods import create_method, method_stages
     from rtgs.scenes.scene import load_scene
     from rtgs.train.seeds import generator_for
@@ -203,17 +238,24 @@ def measure(words: Sequence[str], shrunk: Sequence[str], threads: int) -> list[S
     config, _ = compose([*words, *shrunk])
     whole = compose(list(words))[0]
     scene = replace(load_scene(config.scene), test=())
-    method = create_method(config.method, scene, config.schedule, generator_for(config.seed, "initialise"))
-    stages = method_stages(whole.method, whole.schedule)
+    transparent = not why_unbounded([view.mask for view in scene.train])
     clock = time.thread_time if threads == 1 else time.perf_counter
-    return stage_shares(method, scene, config.seed, clock, [stage.until - stage.from_step for stage in stages])
 
+    def new(mesh: ObjectMesh | None = None) -> Method:
+        generator = generator_for(config.seed, "initialise")
+        return create_method(config.method, scene, config.schedule, generator, mesh)
 
-def whole_minutes(stages: Sequence[StageShares]) -> tuple[float, float]:
-    """Minutes by the clock of the benchmark, and CPU minutes of all threads, of the training as the preset has it."""
-    scale = [stage.preset_steps / stage.steps / 60 for stage in stages]
-    by_clock = sum(factor * stage.seconds for factor, stage in zip(scale, stages, strict=True))
-    return by_clock, sum(factor * stage.cpu_seconds for factor, stage in zip(scale, stages, strict=True))
+    both = (method_stages(one.method, one.schedule, transparent=transparent) for one in (config, whole))
+    method, found, times = new(), [], (0.0, 0.0)
+    for stage, complete in zip(*both, strict=True):
+        if stage.name == "transmittance":
+            start = clock(), time.process_time()
+            third = new(found_mesh(method, stage.from_step, scene, config))
+            third.load({name: tensor.clone() for name, tensor in method.state().items()})
+            times, method = (clock() - start[0], time.process_time() - start[1]), third
+        steps = complete.until - complete.from_step
+        found.append(stage_shares(method, scene, config.seed, clock, stage, steps))
+    return Training(tuple(found), *times)
 
 
 def shrunk_words(steps: int, words: Sequence[str]) -> list[str]:
@@ -255,16 +297,19 @@ def main() -> None:
     options = parser.parse_args()
     words = [f"scene={options.scene}", f"method={options.method}", f"preset={options.preset}", *options.set]
     shrunk = shrunk_words(options.steps, words) if options.steps else []
-    stages = measure(words, shrunk, options.threads)
-    minutes, cpu_minutes = whole_minutes(stages)
+    training = measure(words, shrunk, options.threads)
+    stages, (minutes, cpu_minutes) = training.stages, training.minutes()
     extrapolated = any(stage.steps != stage.preset_steps for stage in stages)
     print(table(stages))
     kind = "CPU, one thread" if options.threads == 1 else f"by the clock, {options.threads} threads"
     source = "extrapolated from milliseconds a step" if extrapolated else "measured"
+    if training.mesh_seconds:
+        print(f"\nThe object's mesh: {training.mesh_seconds:.1f} s.")
     print(f"\nWhole training: {minutes:.1f} min {kind}; {cpu_minutes:.1f} CPU min of all threads ({source}).")
     result = {"scene": options.scene, "method": options.method, "preset": options.preset, "threads": options.threads}
     result |= {"seconds": round(sum(stage.seconds for stage in stages), 1), "extrapolated": extrapolated}
     result |= {"minutes": round(minutes, 3), "cpu_minutes": round(cpu_minutes, 3)}
+    result |= {"mesh_seconds": round(training.mesh_seconds, 2), "machine": machine()}
     result |= {"stages": [asdict(stage) for stage in stages]}
     print(json.dumps(result))
 

@@ -56,9 +56,26 @@ def test_verdicts_follow_the_spread_and_borrow_it():
     assert "beats 2dgs by more than 2x the spread: +0.60 dB" in toycar.sentence("2dgs", "on specular objects")
     assert "-0.30 dB overall, worse than 0.1 dB" in sedan.sentence("2dgs", "on specular objects")
     assert "spread unknown" in alone.sentence("2dgs", "on specular objects")
-    first, second = summary([toycar, spheres, sedan, alone], "2dgs")
-    assert first == "rtgs: beats 2dgs on 1 of 3 scenes; worse than 0.1 dB overall on sedan"
-    assert second == "envgs: its gain cannot be judged, no spread; nowhere worse than 0.1 dB"
+    first, second = summary([toycar, spheres, sedan, alone], "2dgs", "in the masks")
+    mean = "by +0.15 dB in the masks on average over 3"
+    assert first == f"rtgs: beats 2dgs on 1 of 3 scenes, {mean}; worse than 0.1 dB overall on sedan"
+    mean = "by +1.00 dB in the masks on average over 1"
+    assert second == f"envgs: its gain cannot be judged, no spread, {mean}; nowhere worse than 0.1 dB"
+
+
+def test_the_reference_may_be_the_same_method_stopped_a_stage_earlier():
+    """Where no view has a mask nothing is known there; no harm is the difference over all pixels."""
+    same = runs({0: 0.0})
+    entries = [
+        Entry("matte_room", "rtgs+two_stages", same, ()),
+        Entry("matte_room", "rtgs", same, same),
+        Entry("fox", "rtgs", runs({0: -0.09}), same),
+    ]
+    lines = [one.sentence("rtgs+two_stages", "in the masks") for one in verdicts(entries, "masked")]
+    assert lines[0] == "matte_room, rtgs: nothing is known in the masks; +0.00 dB overall"
+    assert lines[1] == "fox, rtgs: nothing is known in the masks; -0.09 dB overall"
+    found = summary(verdicts(entries, "masked"), "rtgs+two_stages", "in the masks")
+    assert found == ["rtgs: its gain cannot be judged, no spread; nowhere worse than 0.1 dB"]
 
 
 def test_what_is_not_known_is_no_success():
