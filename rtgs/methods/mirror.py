@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from rtgs.native import core
+from rtgs.optics.light import decoded, encoded
 from rtgs.optics.microfacet import SpecularWeights, specular_weights
 from rtgs.optics.reflection import reflection_weight
 from rtgs.optics.settings import OpticsSettings
@@ -100,14 +101,19 @@ def reflected_weight(cosine: Tensor, pixels: SurfacePixels, optics: OpticsSettin
     return reflection_weight(cosine, pixels.roughness, pixels.f0.T, optics).T
 
 
-def specular_change(pixels: SurfacePixels, light: Tensor, emphasis: Tensor | None) -> Tensor:
+def specular_change(pixels: SurfacePixels, light: Tensor, emphasis: Tensor | None, blend: str = "srgb") -> Tensor:
     """(3, P) what traced light adds to C_d: k_s (light - C_d), so that C_d plus it is (1 - k_s) C_d + k_s light.
 
-    ``light`` (3, P): w_r C_r, and w_t C_t where the pixel shows a transparent object.
+    ``light`` (3, P): w_r C_r, and w_t C_t where the pixel shows a transparent object. With ``blend`` "linear" it is
+    linear light, and so is the mixture, which is encoded afterwards.
     ``emphasis`` (P,) multiplies the gradient and leaves the value alone: 1 / share for pixels drawn with that share
     makes the gradient of every parameter right on average (docs/reflection.md).
     """
-    change = pixels.specular * (light - pixels.diffuse)
+    if blend == "srgb":
+        change = pixels.specular * (light - pixels.diffuse)
+    else:
+        diffuse = decoded(pixels.diffuse, blend)
+        change = encoded(diffuse + pixels.specular * (light - diffuse), blend) - pixels.diffuse
     return change if emphasis is None else _Emphasize.apply(change, emphasis)  # type: ignore[return-value]
 
 

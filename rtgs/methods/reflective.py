@@ -42,6 +42,7 @@ from rtgs.methods.propagation import propagate_normals, reset_specular
 from rtgs.methods.reflection_set import ReflectionSet, reflection_surfels, scene_color
 from rtgs.methods.surfel_base import SurfelMethod
 from rtgs.methods.traced_pixels import TracedPixels, choose_pixels
+from rtgs.optics.light import decoded, encoded
 from rtgs.render.buffers import RasterBuffers, TraceOptions
 from rtgs.train.losses import surface_depth
 from rtgs.train.perceptual import PerceptualLoss
@@ -193,21 +194,23 @@ class ReflectiveMethod(SurfelMethod):
         reflection, transmission = self._weights(
             mirrored, pixels, None if glass is None else glass.inside[chosen.index]
         )
-        light, passed = reflection * color, None
+        blend = self.settings.optics.blend
+        light, passed = reflection * decoded(color, blend), None
         if glass is not None:
             passed = self.transmit(glass, glass_rays(glass, chosen.index, rays.origin, view), step, options)
-            light = light + transmission * passed.color
-        change = specular_change(pixels, light, chosen.emphasis)
+            light = light + transmission * decoded(passed.color, blend)
+        change = specular_change(pixels, light, chosen.emphasis, blend)
         shape = (3, camera.height, camera.width)
         image = flat.diffuse.index_add(1, chosen.index, change).reshape(shape)
         specular = flat.specular.reshape(shape[1:])
         layers = None
         if options is not None and options.layers:
-            layers = specular_layers(flat, chosen, pixels.specular * reflection * color, color, shape)
+            reflected = encoded(pixels.specular * reflection * decoded(color, blend), blend)
+            layers = specular_layers(flat, chosen, reflected, color, shape)
         if glass is None or passed is None:
             return RenderedView(camera, image, buffers, layers, specular)
         if layers is not None:
-            through = pixels.specular * transmission * passed.color
+            through = encoded(pixels.specular * transmission * decoded(passed.color, blend), blend)
             both = (full_map(values.detach(), chosen, shape) for values in (through, passed.color))
             layers = replace(layers, **dict(zip(("transmission", "transmitted_color"), both, strict=True)))
         seen_through = glass.inside.reshape(shape[1:])

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 WEIGHTS = ("microfacet", "literal", "split_sum", "envgs")
 REMAPS = ("pbrt", "none")
 MASKINGS = ("correlated", "separable")
+BLENDS = ("srgb", "linear")
 
 
 @dataclass(frozen=True)
@@ -26,9 +27,11 @@ class OpticsSettings:
     cosine_floor: float = 1e-3  # of n . omega_o
     literal_cosine_floor: float = 0.1  # the same for "literal", which divides by it
     detach_cosine: bool = False  # keep the weight's gradient away from the normal
+    # In which light C_d, C_r and C_t are mixed: their sRGB encoding, as the paper, or linear light (glass.md).
+    blend: str = field(default="srgb", metadata={"recipe": "unless default"})
 
     def __post_init__(self) -> None:
-        for name, legal in (("weight", WEIGHTS), ("remap", REMAPS), ("masking", MASKINGS)):
+        for name, legal in (("weight", WEIGHTS), ("remap", REMAPS), ("masking", MASKINGS), ("blend", BLENDS)):
             if getattr(self, name) not in legal:
                 raise ValueError(f"method.optics.{name} is {getattr(self, name)!r}: choose one of {', '.join(legal)}")
         if not (self.max_gain >= 0 and math.isfinite(self.max_gain)):

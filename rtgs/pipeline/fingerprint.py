@@ -17,6 +17,11 @@ NOT_IN_RECIPE = {"recipe": False}
 ``source: str = field(metadata=NOT_IN_RECIPE)``. Such a field does not enter the fingerprint."""
 
 
+UNLESS_DEFAULT = {"recipe": "unless default"}
+"""Metadata of a field with a plain default that was added to a recipe of old: while it has its default it stays out, so
+that what was made before keeps its key. (Rooms below the pipeline write the mapping itself.)"""
+
+
 def canonical_json(value: object) -> str:
     """``value`` as JSON that depends on its meaning only: sorted keys, floats by ``repr``, no blanks.
 
@@ -47,13 +52,18 @@ def _plain(value: object, where: str) -> object:
         return {
             field.name: _plain(getattr(value, field.name), f"{where}.{field.name}")
             for field in dataclasses.fields(value)
-            if field.metadata.get("recipe", True)
+            if _in_recipe(field, getattr(value, field.name))
         }
     raise TypeError(
         f"{where} is a {type(value).__name__}, which has no canonical JSON. Parameters of a step are plain values and "
         "dataclasses of them: write a path as a string outside the recipe, a set as a sorted list, and convert "
         "OmegaConf containers with rtgs.config.convert"
     )
+
+
+def _in_recipe(field: dataclasses.Field, value: object) -> bool:
+    kept = field.metadata.get("recipe", True)
+    return value != field.default if kept == UNLESS_DEFAULT["recipe"] else bool(kept)
 
 
 def fingerprint(recipe: object) -> str:

@@ -33,6 +33,15 @@ def doubled(surfels: Surfels) -> Surfels:
     return type(surfels)(**values)
 
 
+def to_linear(color: Tensor) -> Tensor:
+    """The sRGB curve as its standard writes it, for colours above 0.04045 and black ones."""
+    return torch.where(color > 0.04045, ((color.clamp_min(0.04) + 0.055) / 1.055) ** 2.4, color / 12.92)
+
+
+def to_srgb(light: Tensor) -> Tensor:
+    return torch.where(light > 0.0031308, 1.055 * light.clamp_min(0.003) ** (1 / 2.4) - 0.055, 12.92 * light)
+
+
 class GlassTwin:
     """Reads a method's settings and plan, and none of its renderers."""
 
@@ -69,16 +78,19 @@ class GlassTwin:
             self.fragile |= inside & (near_bound if near_bound.ndim == 1 else near_bound.any(0))
             own = own.clamp_max(self.settings.max_weight)
         reflection = torch.where(inside, own, weights.reflection)
-        light = reflection * reflected.colors.T
+        linear = self.method.settings.optics.blend == "linear"
+        light = reflection * (to_linear(reflected.colors.T) if linear else reflected.colors.T)
         rows = (inside & covered).nonzero()[:, 0]
         near = flat.depth.detach()[rows]
         second = (surfaces.second.flatten() & met)[rows]
         far = torch.where(second, torch.maximum(surfaces.far.flatten().double()[rows], near), near)
         color, first = self._through(rays.origin, view[:, rows].T, near, far, second, rows)
+        color = to_linear(color) if linear else color
         light = light + weights.transmission * torch.zeros_like(light).index_copy(1, rows, color.T)
-        change = torch.where(covered, flat.specular * (light - flat.diffuse), 0.0)
         shape = (self.camera.height, self.camera.width)
-        image = (flat.diffuse + change).reshape(3, *shape)
+        base = to_linear(flat.diffuse) if linear else flat.diffuse
+        mixed = (1 - flat.specular) * base + flat.specular * light
+        image = torch.where(covered, to_srgb(mixed) if linear else mixed, flat.diffuse).reshape(3, *shape)
         depth = first.depth if first.depth is not None else near
         return TwinGlass(image, depth[second], self.fragile.reshape(shape))
 

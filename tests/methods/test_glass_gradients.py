@@ -29,12 +29,14 @@ CASES: dict[str, dict[str, object]] = {
 }
 
 
-@pytest.mark.parametrize("case", [*CASES, "raw directions, rgb f0"])
+@pytest.mark.parametrize("case", [*CASES, "raw directions, rgb f0", "linear light"])
 def test_image_and_every_gradient_are_those_of_the_twins(case: str):
     made = glass_scene()
     settings = glass_recipe(**CASES.get(case, {}))
     materials = MaterialSettings(specular=0.3)
-    if case not in CASES:
+    if case == "linear light":
+        settings = replace(settings, optics=replace(settings.optics, blend="linear"))
+    elif case not in CASES:
         settings = replace(settings, reflection=replace(settings.reflection, sh_direction="raw"))
         materials = replace(materials, f0_channels=3)
     method = begun(replace(settings, materials=materials), made)

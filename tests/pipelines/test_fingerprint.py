@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from rtgs.pipeline.fingerprint import NOT_IN_RECIPE, canonical_json, fingerprint, flatten
+from rtgs.optics.settings import OpticsSettings
+from rtgs.pipeline.fingerprint import NOT_IN_RECIPE, UNLESS_DEFAULT, canonical_json, fingerprint, flatten
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,20 @@ def test_dataclass_json_is_sorted_and_without_blanks():
 def test_where_a_capture_lies_does_not_enter():
     assert fingerprint(Outer(source="/elsewhere")) == fingerprint(Outer())
     assert fingerprint(Outer(name="b")) != fingerprint(Outer())
+
+
+def test_a_choice_that_came_later_enters_where_it_is_made():
+    """What was made before it came keeps its key."""
+
+    @dataclass(frozen=True)
+    class Later:
+        steps: int = 3
+        light: str = field(default="srgb", metadata=UNLESS_DEFAULT)
+
+    assert canonical_json(Later()) == '{"steps":3}'
+    assert canonical_json(Later(light="linear")) == '{"light":"linear","steps":3}'
+    assert "blend" not in canonical_json(OpticsSettings())
+    assert '"blend":"linear"' in canonical_json(OpticsSettings(blend="linear"))
 
 
 @pytest.mark.parametrize("spelling", ["0.001", "1.0e-3", "1.e-03", "0.00100"])
