@@ -9,7 +9,8 @@ leaves it alone. Every eighth training view is held out and judged beside the te
 views are only reported. *Bright* pixels are masked pixels of the test views (training views have no truth) whose true
 reflected layer (sRGB encoded, mean of the channels) is above the view's 90th percentile within its mask. Depth and
 normal: share of the test views' masked pixels within 3 % and 15 degrees of the true first surface, where the third
-stage begins and of the final pictures. A Markdown table is written as it grows; last line: a JSON object.
+stage begins and of the final pictures. Loss: test views, dB below the first rung of the same scene and seed, in the
+mask and on bright pixels; +- over the seeds. A Markdown table is written as it grows; last line: a JSON object.
 """
 
 from __future__ import annotations
@@ -20,11 +21,12 @@ import os
 import statistics
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from benchmarks.captures import over_seeds
 from benchmarks.machine import machine
 from benchmarks.specular_choices import HELD_OUT
 
@@ -90,7 +92,8 @@ LADDER: dict[str, Rung] = {
     "tsdf": Rung("TSDF of the base set", lambda *_: ["ablation=mesh_tsdf"]),
     "two_stages": Rung("no third stage", lambda *_: ["ablation=two_stages"]),
     "paper_truth_mesh": Rung(
-        "the paper's way, the true mesh for box and back", lambda s, _: ["ablation=paper_glass", *_given(s)]
+        "the paper's way, the true mesh for box and back",
+        lambda s, _: ["ablation=paper_glass", f"{_I}.count=0", *_given(s)],
     ),
     "paper": Rung("the paper's way: full second stage, no interface, TSDF", _paper()),
     "paper_propagation": Rung("the paper's way, normal propagation", lambda _, c: _paper()(_, c) + _propagation(c)),
@@ -169,8 +172,9 @@ class Measured:
 
 COLUMNS = (
     *("scene", "rung", "held out", "in the mask", "PSNR", "SSIM", "in the mask", "SSIM", "bright"),
-    *("depth before", "after", "normal before", "after", "IoU", "CPU s"),
+    *("depth before", "after", "normal before", "after", "IoU", "CPU s", "loss in the mask", "bright"),
 )
+DIGITS = (2, 2, 2, 3, 2, 3, 2, 2, 2, 2, 2, 3, 0)  # of the fields of Measured
 
 
 def prepare(scene: str, arguments: argparse.Namespace) -> Setting:
@@ -206,12 +210,12 @@ def sized(arguments: argparse.Namespace) -> list[str]:
     return [*(SMALL if arguments.size == "small" else ()), *arguments.set]
 
 
-def run(name: str, setting: Setting, arguments: argparse.Namespace) -> Measured | str:
+def run(name: str, setting: Setting, arguments: argparse.Namespace, seed: int) -> Measured | str:
     """Run the rung, or find it done; a string is why it failed."""
-    words = [f"scene={setting.scene}", "method=rtgs", f"preset={arguments.preset}", f"seed={arguments.seed}"]
+    words = [f"scene={setting.scene}", "method=rtgs", f"preset={arguments.preset}", f"seed={seed}"]
     words += [f"scene.split_file={setting.split}", "evaluation.lpips=false", *sized(arguments)]
     words += RUNGS[name].words(setting, base_config(setting.scene, arguments))
-    words += [f"name={setting.scene}-{name}", f"threads={arguments.threads}", "tracking=off"]
+    words += [f"name={setting.scene}-{name}-{seed}", f"threads={arguments.threads}", "tracking=off"]
     done = subprocess.run(
         [sys.executable, "-m", "pipelines.run", *words, f"paths.root={arguments.root}"],
         env=os.environ | {"OMP_NUM_THREADS": str(arguments.threads)},
@@ -221,7 +225,7 @@ def run(name: str, setting: Setting, arguments: argparse.Namespace) -> Measured 
     )
     if done.returncode:
         return (done.stderr.strip().splitlines() or ["no message"])[-1]
-    return read(arguments.root, f"{setting.scene}-{name}", setting.held_out)
+    return read(arguments.root, f"{setting.scene}-{name}-{seed}", setting.held_out)
 
 
 def read(root: Path, name: str, held_out: Sequence[str]) -> Measured:
@@ -282,14 +286,36 @@ def bright_pixels(view: View) -> Tensor:
     return view.mask & (light >= light[view.mask].quantile(BRIGHT))
 
 
-def row(scene: str, name: str, found: Measured) -> list[str]:
+BySeed = Mapping[int, Measured]
+
+
+def losses(found: BySeed, first: BySeed) -> dict[str, list[float]]:
+    """dB below the first rung, one value per seed that both have; over the same views, so paired."""
+    both = [(first[seed], found[seed]) for seed in found if seed in first]
+    masked = [theirs.psnr_masked - ours.psnr_masked for theirs, ours in both]
+    return {"masked": masked, "bright": [theirs.psnr_bright - ours.psnr_bright for theirs, ours in both]}
+
+
+def row(scene: str, name: str, found: BySeed, first: BySeed) -> list[str]:
     """One line of the table."""
 
-    def cell(value: float | None, digits: int) -> str:
-        return "-" if value is None else f"{value:.{digits}f}"
+    def cell(values: Sequence[float | None], digits: int) -> str:
+        known = [value for value in values if value is not None]
+        return over_seeds(known, digits) if known else "-"
 
-    digits = (2, 2, 2, 3, 2, 3, 2, 2, 2, 2, 2, 3, 0)
-    return [scene, RUNGS[name].what, *(cell(v, d) for v, d in zip(asdict(found).values(), digits, strict=True))]
+    fields = zip(*(asdict(one).values() for one in found.values()), strict=True)
+    cells = [cell(values, digits) for values, digits in zip(fields, DIGITS, strict=True)]
+    return [scene, RUNGS[name].what, *cells, *(cell(values, 2) for values in losses(found, first).values())]
+
+
+def figures_of(scene: str, name: str, found: BySeed, first: BySeed) -> dict[str, Any]:
+    """One line of the table: means over the seeds, every seed's own, and the losses."""
+    runs = [asdict(one) for one in found.values()]
+    means = {}
+    for key in runs[0]:
+        known = [one[key] for one in runs if one[key] is not None]
+        means[key] = statistics.fmean(known) if known else None
+    return {"scene": scene, "rung": name, **means, "seeds": list(found), "runs": runs, "loss": losses(found, first)}
 
 
 def table(rows: Sequence[Sequence[str]]) -> str:
@@ -301,15 +327,20 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     """All rungs, the table printed and written as it grows; the figures."""
     rows, figures, failures = [], [], []
     for scene in arguments.scenes:
-        setting = prepare(scene, arguments)
+        setting, first = prepare(scene, arguments), {}
         for name in named(arguments.rungs):
-            found = run(name, setting, arguments)
-            if isinstance(found, str):
-                failures.append(f"{scene}, {name}: {found}")
-                print(failures[-1], flush=True)
-            else:
-                rows.append(row(scene, name, found))
-                figures.append({"scene": scene, "rung": name, **asdict(found)})
+            found: dict[int, Measured] = {}
+            for seed in arguments.seeds:
+                outcome = run(name, setting, arguments, seed)
+                if isinstance(outcome, str):
+                    failures.append(f"{scene}, {name}, seed {seed}: {outcome}")
+                    print(failures[-1], flush=True)
+                else:
+                    found[seed] = outcome
+            if found:
+                first = first or found
+                rows.append(row(scene, name, found, first))
+                figures.append(figures_of(scene, name, found, first))
                 print("  ".join(rows[-1]), flush=True)
             write(arguments, rows, failures)
     print(f"\n{table(rows)}", flush=True)
@@ -324,7 +355,7 @@ def named(words: Sequence[str]) -> list[str]:
 def write(arguments: argparse.Namespace, rows: Sequence[Sequence[str]], failures: Sequence[str]) -> None:
     """The table so far, with the command that makes it."""
     words = f"--preset {arguments.preset} --size {arguments.size} --scenes {' '.join(arguments.scenes)} "
-    words += f"--rungs {' '.join(arguments.rungs)}"
+    words += f"--rungs {' '.join(arguments.rungs)} --seeds {' '.join(map(str, arguments.seeds))}"
     words += f" --set {' '.join(arguments.set)}" if arguments.set else ""
     text = f"`python -m benchmarks.glass_ladder {words}`\n\n{table(rows)}"
     text += "".join(f"\n- failed: {failure}" for failure in failures)
@@ -340,7 +371,7 @@ def parse() -> argparse.Namespace:
     every = [*GROUPS, *RUNGS]
     add("--rungs", nargs="+", default=["ladder"], choices=every, metavar="NAME", help=", ".join(every))
     add("--size", default="small", choices=("small", "preset"), help="small: 128 pixels, 1,000 steps; preset: as it is")
-    add("--seed", type=int, default=0)
+    add("--seeds", nargs="+", type=int, default=[0])
     add("--threads", type=int, default=1)
     add("--root", type=Path, default=Path("benchmarks/results/glass"), help="folder of store and runs")
     add("--out", type=Path, help="Markdown file (default: ROOT/ladder-PRESET.md)")

@@ -14,13 +14,18 @@ from benchmarks import glass_ladder
 from benchmarks.glass_ladder import (
     BRIGHT,
     CHOICES,
+    COLUMNS,
     LADDER,
     RUNGS,
+    Measured,
     Setting,
     base_config,
     bright_pixels,
+    figures_of,
+    losses,
     named,
     prepare,
+    row,
     sized,
 )
 from pipelines.graph import build_graph
@@ -104,11 +109,27 @@ def test_a_rung_goes_through_the_pipeline(
     assert figures["normal_after"] > 0.1
     assert all(figures[name] > 3 for name in ("psnr", "psnr_masked", "psnr_bright", "psnr_held_out"))
     assert figures["seconds"] > 0
+    assert figures["seeds"] == [0]
+    assert figures["loss"] == {"masked": [0.0], "bright": [0.0]}, "below the first rung, itself"
     text = (tmp_path / "ladder-smoke.md").read_text()
     assert text.startswith(
-        "`python -m benchmarks.glass_ladder --preset smoke --size preset --scenes ball_statue --rungs truth"
+        "`python -m benchmarks.glass_ladder --preset smoke --size preset --scenes ball_statue --rungs truth --seeds 0"
     )
     assert "| ball_statue | true mesh, true normals held fixed |" in text
+
+
+def test_losses_are_paired_by_seed_and_have_a_spread():
+    def measured(masked: float, bright: float) -> Measured:
+        return Measured(20.0, 19.0, 21.0, 0.8, masked, 0.7, bright, None, 0.5, None, 0.5, 0.99, 7.0)
+
+    first = {0: measured(20.0, 15.0), 1: measured(22.0, 16.0), 2: measured(24.0, 17.0)}
+    hull = {0: measured(19.5, 13.0), 1: measured(21.4, 14.5), 3: measured(9.0, 9.0)}
+    assert losses(hull, first)["masked"] == pytest.approx([0.5, 0.6]), "seeds that both have"
+    cells = dict(zip(COLUMNS[-2:], row("ball_statue", "hull", hull, first)[-2:]))
+    assert cells == {"loss in the mask": "0.55 +- 0.07", "bright": "1.75 +- 0.35"}
+    assert row("ball_statue", "hull", hull, first)[COLUMNS.index("depth before")] == "-"
+    assert len(row("ball_statue", "truth", first, first)) == len(COLUMNS)
+    assert figures_of("ball_statue", "truth", first, first)["psnr_masked"] == pytest.approx(22.0)
 
 
 def test_bright_pixels_are_the_brightest_tenth_of_the_mask():
