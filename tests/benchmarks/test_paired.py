@@ -80,7 +80,7 @@ def test_the_reference_may_be_the_same_method_stopped_a_stage_earlier():
 
 def test_what_is_not_known_is_no_success():
     without = tuple(replace(run, views={"a": {"psnr_specular": 20.0}}) for run in runs({0: 0.0}))
-    (line,) = summary(verdicts([Entry("toycar", "rtgs", without, without)], "specular"), "2dgs")
+    (line,) = summary(verdicts([Entry("toycar", "rtgs", without, without)], "specular"), "2dgs", "on specular objects")
     assert line.endswith("nowhere worse than 0.1 dB (not known on toycar)")
 
 

@@ -121,14 +121,15 @@ def test_shipped_scenes_without_glass_are_trained_as_if_there_were_no_third_stag
     assert run.mesh is None
 
 
-def test_masks_that_a_step_makes_and_that_are_empty_change_nothing(root: Path, tmp_path: Path):  # noqa: F811
+def test_masks_that_a_step_makes_and_that_are_empty_change_nothing(tmp_path: Path, monkeypatch):
     """Known only when it has run: mesh and third stage are planned, and what they leave is the two-stage run."""
+    monkeypatch.setenv("RTGS_ROOT", str(tmp_path))  # a store of its own: the others' executions are counted
     capture = write_capture(tmp_path / "plain ball", "empty")
     words = ["run", f"scene={capture}", "method=rtgs", "masks=given", *QUICK, *TINY]
     words.append("method.reflection.matte.probation=0")
     assert main([*words, "name=three"]) == 0
     assert main([*words, "name=two", "ablation=two_stages"]) == 0
-    three, two = root / "runs" / "three", root / "runs" / "two"
+    three, two = tmp_path / "runs" / "three", tmp_path / "runs" / "two"
     assert "train_transmittance" in json.loads((three / "run.json").read_text())["steps"]
     for name in ("point_cloud.ply", "reflection.ply", *(f"renders/{path.name}" for path in two.glob("renders/*"))):
         assert (three / name).read_bytes() == (two / name).read_bytes(), name
