@@ -27,11 +27,11 @@ import torch
 
 from benchmarks.machine import machine
 from rtgs.cameras import Camera
+from rtgs.mesh.settings import TsdfSettings
 from rtgs.mesh.triangles import TriangleMesh
 from rtgs.mesh.tsdf import (
     BLOCK,
     DepthView,
-    TsdfSettings,
     blocks_near_surface,
     fuse_depths,
     import_open3d,

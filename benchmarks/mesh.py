@@ -20,9 +20,10 @@ from rtgs.mesh.container import ObjectMesh
 from rtgs.mesh.guide import MeshGuide
 from rtgs.mesh.hull import carve_hull
 from rtgs.mesh.score import container_mesh, hit_score, mesh_distance
+from rtgs.mesh.settings import HullSettings, TsdfSettings
 from rtgs.mesh.silhouettes import mask_set, silhouette_score
 from rtgs.mesh.triangles import TriangleMesh
-from rtgs.mesh.tsdf import DepthView, TsdfSettings, fuse_depths, import_open3d, object_fusion
+from rtgs.mesh.tsdf import DepthView, fuse_depths, import_open3d, object_fusion
 from rtgs.scenes.embedded import embedded_capture
 from rtgs.scenes.scene import Scene, load_scene
 from rtgs.scenes.settings import SceneSettings
@@ -47,7 +48,7 @@ def measure(name: str, scene: Scene) -> list[str]:
     cameras = [view.camera for view in scene.train]
     masks = mask_set(cameras, [view.mask for view in scene.train], opaque_depths(name, cameras))
     start = time.process_time()
-    hull = carve_hull(masks)
+    hull = carve_hull(masks, HullSettings())
     seconds = time.process_time() - start
     rows = []
 

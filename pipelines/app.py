@@ -36,6 +36,7 @@ class RunOutcome:
     plan: Plan
     results: tuple[StepResult, ...]
     folder: Path
+    news: bool = True  # something of it was recorded in the tracker now
 
 
 @dataclass(frozen=True)
@@ -52,10 +53,8 @@ def execute(config: RunConfig, choices: Choices) -> RunOutcome:
         CaptureError: the capture cannot be read.
     """
     from pipelines.graph import build_graph, command
-    from rtgs.native import core
 
-    core.isa()  # an instruction set that RTGS_ISA misspells, or that this CPU lacks, stops here and not in training
-    _set_threads(config.threads)
+    _check_threads(config.threads)
     store = Store(config.paths.store)
     remote = remote_store(config)
     graph = build_graph(config, choices)
@@ -65,20 +64,20 @@ def execute(config: RunConfig, choices: Choices) -> RunOutcome:
     for step in graph.skipped:
         log.info("no %s step: %s", step.name, step.why)
     log.info("%s", describe(plan))
-    results, folder = _run(config, choices, _Stores(store, remote), plan, command(choices))
-    _show(results, folder)
-    return RunOutcome(config, plan, results, folder)
+    if not plan.complete:  # else nothing computes, and torch need not be loaded
+        _prepare_process(config.threads)
+    outcome = _run(config, choices, _Stores(store, remote), plan, command(choices))
+    _show(outcome.results, outcome.folder)
+    return outcome
 
 
-def _run(
-    config: RunConfig, choices: Choices, stores: _Stores, plan: Plan, command: str
-) -> tuple[tuple[StepResult, ...], Path]:
+def _run(config: RunConfig, choices: Choices, stores: _Stores, plan: Plan, command: str) -> RunOutcome:
     from pipelines.results import write_run_folder
 
     tracking = open_tracking(config.tracking.kind, Path(config.paths.root), config.tracking.uri)
     if _recorded(config, plan, tracking):
         results = InlineExecutor(stores.local).execute(plan)
-        return results, write_run_folder(config, choices, command, results)
+        return RunOutcome(config, plan, results, write_run_folder(config, choices, command, results), news=False)
     sweep = current_sweep()
     if sweep is None:
         return _tracked(config, choices, stores, plan, command, tracking, "")
@@ -89,16 +88,18 @@ def _run(
 def _recorded(config: RunConfig, plan: Plan, tracking: Tracking) -> bool:
     """Nothing to record: nothing is left to run, and the tracker has this variant.
 
-    A job of a sweep is looked up in its experiment; a single run by what its folder says, so that repeating it stays
-    quick: trackers take seconds to import.
+    Looked up first in what the run's folder says, so that repeating a run stays quick: trackers take seconds to import.
+    A job of a sweep may share its folder with another, so the tracker itself has the last word.
     """
     from pipelines.results import is_tracked
 
     if not plan.complete or prepared_outcomes().executed(plan):
         return False
-    if current_sweep() is None:
-        return config.tracking.kind == "off" or is_tracked(config, plan, _place(config, tracking))
-    return tracking.finished(config.tracking.experiment, plan.steps[-1].step.fingerprint)
+    if config.tracking.kind == "off" or is_tracked(config, plan, _place(config, tracking)):
+        return True
+    return current_sweep() is not None and tracking.finished(
+        config.tracking.experiment, plan.steps[-1].step.fingerprint
+    )
 
 
 def _place(config: RunConfig, tracking: Tracking) -> str:
@@ -107,7 +108,7 @@ def _place(config: RunConfig, tracking: Tracking) -> str:
 
 def _tracked(
     config: RunConfig, choices: Choices, stores: _Stores, plan: Plan, command: str, tracking: Tracking, parent: str
-) -> tuple[tuple[StepResult, ...], Path]:
+) -> RunOutcome:
     from pipelines.results import note_tracked, run_info, track_end, track_start, write_run_folder
 
     with tracking.run(run_info(config, choices, plan, parent)) as tracker:
@@ -116,7 +117,7 @@ def _tracked(
         folder = write_run_folder(config, choices, command, results)
         track_end(tracker, folder, results)
     note_tracked(folder, results, _place(config, tracking))
-    return results, folder
+    return RunOutcome(config, plan, results, folder)
 
 
 def _show(results: Sequence[StepResult], folder: Path) -> None:
@@ -131,14 +132,19 @@ def _short(path: Path) -> str:
     return str(path) if relative.startswith("..") else relative
 
 
-def _set_threads(threads: int | None) -> None:
-    if threads is None:
-        return
-    if threads < 1:
+def _check_threads(threads: int | None) -> None:
+    if threads is not None and threads < 1:
         raise RtgsError(f"config: threads={threads} must be at least 1")
-    import torch
 
-    torch.set_num_threads(threads)
+
+def _prepare_process(threads: int | None) -> None:
+    from rtgs.native import core
+
+    core.isa()  # an instruction set that RTGS_ISA misspells, or that this CPU lacks, stops here and not in training
+    if threads is not None:
+        import torch
+
+        torch.set_num_threads(threads)
 
 
 class HydraApp:
@@ -209,7 +215,8 @@ class HydraApp:
 
         paths = write_experiment_table([(outcome.config, outcome.results) for outcome in self.outcomes])
         if paths and SweepStart.sweep is not None:
-            _track_table(self.outcomes[0].config, SweepStart.sweep, paths)
+            news = any(outcome.news for outcome in self.outcomes)
+            _track_table(self.outcomes[0].config, SweepStart.sweep, paths, news)
         return paths
 
 
@@ -274,11 +281,18 @@ def run_hydra(arguments: Sequence[str]) -> None:
         raise app.error
 
 
-def _track_table(config: RunConfig, sweep: Sweep, paths: Sequence[Path]) -> None:
+def _track_table(config: RunConfig, sweep: Sweep, paths: Sequence[Path], news: bool) -> None:
+    """Add the table to the run of the sweep. A sweep without ``news`` whose table is recorded already adds nothing."""
+    from pipelines.tables import is_table_tracked, note_table_tracked
+
     tracking = open_tracking(config.tracking.kind, Path(config.paths.root), config.tracking.uri)
+    place = _place(config, tracking)
+    if config.tracking.kind == "off" or (not news and is_table_tracked(paths, place)):
+        return
     with tracking.sweep(sweep.group(config.tracking.experiment)) as group:
         for path in paths:
             group.artifact(path)
+    note_table_tracked(paths, _place(config, tracking))
 
 
 def _know_own_launcher() -> None:

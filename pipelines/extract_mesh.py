@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 
 from pipelines.training import last_training, load_method
 from rtgs.errors import RtgsError
-from rtgs.mesh.settings import ObjectSettings
-from rtgs.mesh.tsdf import TsdfSettings
+from rtgs.mesh.settings import ObjectSettings, TsdfSettings
 from rtgs.pipeline import StepContext, StepKind
 
 if TYPE_CHECKING:

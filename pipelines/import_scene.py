@@ -16,7 +16,7 @@ class ImportParams:
     settings: SceneSettings
     """With an empty path."""
     capture: str
-    """Digest of every file the import reads (:func:`rtgs.scenes.canonical.capture_digest`)."""
+    """Digest of every file the import reads (:func:`rtgs.scenes.digest.capture_digest`)."""
     path: str = field(metadata=NOT_IN_RECIPE)
 
 
@@ -26,7 +26,7 @@ def import_params(settings: SceneSettings) -> ImportParams:
     Raises:
         CaptureError: the capture cannot be read.
     """
-    from rtgs.scenes.canonical import capture_digest
+    from rtgs.scenes.digest import capture_digest
 
     return ImportParams(replace(settings, path=""), capture_digest(settings), settings.path)
 
@@ -39,7 +39,7 @@ def prepared_params(settings: SceneSettings, source: Path) -> ImportParams:
     Raises:
         CaptureError: the split file cannot be read.
     """
-    from rtgs.scenes.canonical import files_digest
+    from rtgs.scenes.digest import files_digest
 
     root = source if source.is_dir() else source.parent
     split = "" if settings.split_file is None else files_digest("split", root, [root / settings.split_file])
@@ -82,6 +82,7 @@ STEP = StepKind(
         "rtgs.scenes.scene",
         "rtgs.scenes.images",
         "rtgs.scenes.truth",
+        "rtgs.scenes.truth_files",
         "rtgs.scenes.synthetic.record",
         "rtgs.scenes.points",
         "rtgs.scenes.splits",

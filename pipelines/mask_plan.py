@@ -150,13 +150,13 @@ def draws_panes(step: Step) -> bool:
 
 
 def _capture_digest(imported: import_scene.ImportParams, scene: SceneSettings) -> str:
-    from rtgs.scenes.canonical import capture_digest
+    from rtgs.scenes.digest import capture_digest
 
     return capture_digest(replace(scene, path=imported.path))
 
 
 def _marks_digest(config: RunConfig, method: str, folder: Path) -> str:
-    from rtgs.scenes.canonical import files_digest
+    from rtgs.scenes.digest import files_digest
 
     settings = config.masks
     if method == "grounded_sam2" or (method == "given" and settings.given.layout == "alpha"):

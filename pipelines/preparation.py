@@ -121,7 +121,7 @@ def _normals_step(config: RunConfig, imported: import_scene.ImportParams, before
 
 def _photo_digest(imported: import_scene.ImportParams, scene: object) -> str:
     """Digest of photos and poses alone: masks do not concern their normals."""
-    from rtgs.scenes.canonical import capture_digest
+    from rtgs.scenes.digest import capture_digest
     from rtgs.scenes.settings import SceneSettings
 
     assert isinstance(scene, SceneSettings)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import os
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from pipelines.results import evaluation_of
@@ -10,6 +13,9 @@ from rtgs.config.schema import RunConfig
 from rtgs.evaluate.publish import PAPER_DATA, Measured, TableSpec, build_table
 from rtgs.evaluate.table_formats import write_table
 from rtgs.pipeline import StepResult
+from rtgs.pipeline.fingerprint import file_digest
+
+_TRACKED_FILE = ".tracked.json"  # beside a table: digests of its files by the tracker that has them
 
 
 def write_experiment_table(runs: Sequence[tuple[RunConfig, Sequence[StepResult]]]) -> list[Path]:
@@ -34,3 +40,29 @@ def write_experiment_table(runs: Sequence[tuple[RunConfig, Sequence[StepResult]]
     spec = TableSpec(config.table.name, config.table.title or config.table.name, config.table.data)
     folder = f"{config.table.name}-{preset}" + ("-papers_data" if spec.data == PAPER_DATA else "")
     return list(write_table(config.paths.tables / folder, build_table(spec, measured)))
+
+
+def is_table_tracked(paths: Sequence[Path], place: str) -> bool:
+    """Whether the tracker at ``place`` has these very files, by the note beside them."""
+    return _tracked_digests(paths).get(place) == _digests(paths)
+
+
+def note_table_tracked(paths: Sequence[Path], place: str) -> None:
+    """Note beside the files of a table that the tracker at ``place`` has them."""
+    note = paths[0].with_name(_TRACKED_FILE)
+    partial = note.with_name(f"{note.name}.{os.getpid()}")
+    known = {**_tracked_digests(paths), place: _digests(paths)}
+    partial.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
+    os.replace(partial, note)
+
+
+def _tracked_digests(paths: Sequence[Path]) -> dict[str, dict[str, str]]:
+    with suppress(OSError, ValueError):
+        known = json.loads(paths[0].with_name(_TRACKED_FILE).read_text(encoding="utf-8"))
+        if isinstance(known, dict):
+            return known
+    return {}
+
+
+def _digests(paths: Sequence[Path]) -> dict[str, str]:
+    return {path.name: file_digest(path) for path in paths}

@@ -22,6 +22,7 @@ STEP = StepKind(
         "rtgs.methods.surfel_set",
         "rtgs.train.trainer",
         "rtgs.train.schedule",
+        "rtgs.train.view_order",
         "rtgs.train.losses",
         "rtgs.train.adam",
         "rtgs.gaussians.initialize",

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from pipelines.preparation import Preparation
 from rtgs.config.schema import RunConfig
+from rtgs.mesh.settings import COVERED
 from rtgs.methods import has_third_stage
 from rtgs.prepare.source import find_source
 
@@ -32,7 +33,6 @@ def find_transparency(config: RunConfig, prepared: Preparation) -> Transparency:
     files = _mask_files(config)
     if not files:
         return Transparency(False, "the scene has no masks of transparent objects")
-    from rtgs.mesh.silhouettes import COVERED
     from rtgs.scenes.images import read_mask
 
     full = 0

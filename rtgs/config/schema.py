@@ -10,8 +10,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from rtgs.mesh.settings import ObjectSettings
-from rtgs.mesh.tsdf import TsdfSettings
+from rtgs.mesh.settings import ObjectSettings, TsdfSettings
 from rtgs.prepare.masks_settings import MaskSettings
 from rtgs.prepare.settings import NormalSettings, SfmSettings
 from rtgs.scenes.settings import SceneSettings

@@ -11,11 +11,12 @@ import os
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-
-import torch
-from torch import Tensor
+from typing import TYPE_CHECKING
 
 from rtgs.errors import RtgsError
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 SUMS_FILE = "SHA256SUMS"
 
@@ -85,8 +86,15 @@ def weight_folders() -> tuple[Path, ...]:
     folders.append(Path(__file__).resolve().parents[2] / "weights")
     if os.environ.get("RTGS_SHARED"):
         folders.append(Path(os.environ["RTGS_SHARED"]).expanduser() / "data" / "weights")
-    folders.append(Path(torch.hub.get_dir()) / "checkpoints")
+    folders.append(_torch_cache() / "hub" / "checkpoints")
     return tuple(folders)
+
+
+def _torch_cache() -> Path:
+    """Where torch keeps what it downloads (``torch.hub``'s documentation), found without loading torch."""
+    if os.environ.get("TORCH_HOME"):
+        return Path(os.environ["TORCH_HOME"]).expanduser()
+    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "torch"
 
 
 def find_weights(file: PretrainedFile, folders: Iterable[Path] | None = None) -> Path:
@@ -210,10 +218,12 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
             return load_file(path)
         except (SafetensorError, OSError) as error:
             raise WrongWeights(f"{path} is not a readable safetensors file: {error}") from error
+    import torch
+
     try:
         loaded = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises many kinds, from zip errors to pickle errors
         raise WrongWeights(f"{path} is not a readable checkpoint of tensors: {error}") from error
-    if not isinstance(loaded, dict) or not all(isinstance(value, Tensor) for value in loaded.values()):
+    if not isinstance(loaded, dict) or not all(isinstance(value, torch.Tensor) for value in loaded.values()):
         raise WrongWeights(f"{path} holds {type(loaded).__name__}, expected a dictionary of tensors (a state dict)")
     return loaded

@@ -17,35 +17,17 @@ from torch import Tensor
 from rtgs.errors import RtgsError
 from rtgs.mesh.grid import Grid, bounding_grid, refined, tightened
 from rtgs.mesh.outlines import MaskField, Outline, first_outlines, plain_outlines, refined_outlines
+from rtgs.mesh.settings import AUTOMATIC, HullSettings
 from rtgs.mesh.silhouettes import MaskSet, MaskView, focus_point, silhouette_score
 from rtgs.mesh.smoothing import main_pieces, surface_of_field, taubin
 from rtgs.mesh.triangles import TriangleMesh
 
-AUTOMATIC = -1
 _FEWEST = 3  # masks
 _MOST_OUTVOTED = 4  # masks: more dilates the hull visibly
 _VIEWS_PER_OUTVOTED = 8  # each costs sharpness: one for so many views
 _TRIAL_VOXELS = 48  # of the hulls among which the automatic k chooses
 _GENEROUS = 4  # the first rough hull lets one view in so many be wrong
 _TRIAL_STRIDE = 3  # pixels
-
-
-@dataclass(frozen=True)
-class HullSettings:
-    """Numbers of the carving; measured in docs/mesh.md."""
-
-    voxels: int = 96  # along the longest side of the object
-    outvoted: int = AUTOMATIC  # k: masks that may be wrong about a point; -1: what agrees best with most masks
-    tie: float = 0.004  # a larger k must raise the median silhouette IoU by more than this
-    explained: float = 0.98  # median IoU from which on nothing opaque is thought to hide parts of the object
-    min_seen: float = 0.4  # share of the views that must have a point in the picture for it to belong to the object
-    smoothing: int = 10  # iterations of Taubin's filter
-    trim: bool = True  # cut off what the base set's depth shows to lie behind other surfaces (the unseen bottom)
-    trim_views: int = 8  # views in front of whose depth a point must lie to stay
-    trim_margin: float = 0.5  # voxels that it may lie behind it
-    min_piece: float = 0.05  # pieces with a smaller share of the largest one's volume go
-    min_views: int = 12  # masks; with fewer the hull is not chosen by mesh.source = auto
-    min_spread: float = 60.0  # degrees between the two farthest views; with less the hull is not chosen either
 
 
 @dataclass(frozen=True)
@@ -63,7 +45,7 @@ class HullResult:
     hidden: tuple[Tensor, ...]  # (H, W) bool for each mask: pixels at which something opaque may hide the object
 
 
-def carve_hull(masks: MaskSet, settings: HullSettings = HullSettings()) -> HullResult:
+def carve_hull(masks: MaskSet, settings: HullSettings) -> HullResult:
     """The visual hull of the masks, smoothed; where the views have depth, trimmed, and not carved by what hides it.
 
     Raises:

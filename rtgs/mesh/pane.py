@@ -30,16 +30,6 @@ _BESIDE = 0.25  # of the picture: drawn panes are kept so far beyond its border
 
 
 @dataclass(frozen=True)
-class PaneSettings:
-    """When one plane counts as an explanation of the masks."""
-
-    agree: float = 0.9  # silhouette IoU over the training views a pane needs
-    better: float = 0.02  # IoU by which a hull, where there can be one, must beat it
-    min_views: int = 3
-    min_spread: float = 10.0  # degrees between the two farthest views: below, every plane explains them
-
-
-@dataclass(frozen=True)
 class Pane:
     """A fitted pane."""
 

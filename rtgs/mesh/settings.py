@@ -1,14 +1,61 @@
-"""How the transparent object's mesh is found: one schema of everything that can be chosen."""
+"""How the transparent object's mesh is found: one schema of everything that can be chosen.
+
+Without torch: a plan is made from the cache alone, and reading the schema is part of it.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from rtgs.mesh.hull import HullSettings
-from rtgs.mesh.pane import PaneSettings
-
 SOURCES = ("auto", "hull", "tsdf", "given")
 FLAT = ("auto", "yes", "no")
+COVERED = 0.999  # share of the picture from which on a mask says that everything is the object
+AUTOMATIC = -1  # of HullSettings.outvoted
+
+
+@dataclass(frozen=True)
+class TsdfSettings:
+    """Numbers of the fusion. Lengths in world units; 0 means derived, as its comment says."""
+
+    depth_trunc: float = 0.0  # depths beyond it are ignored; 0: depth_trunc_radii * radius of the cameras
+    depth_trunc_radii: float = 2.0  # 2DGS bounded mode
+    voxel: float = 0.0  # 0: depth_trunc / resolution
+    resolution: int = 1024  # 2DGS
+    finest_pixels: float = 1.0  # a derived voxel is no finer than this many pixels seen from the radius; 0: as 2DGS
+    truncation_voxels: float = 5.0  # 2DGS
+    min_alpha: float = 0.5  # depths of pixels with less alpha are ignored (2DGS, its mask rule)
+    min_weight: float = 1.0  # observations a voxel needs to carry surface; 2DGS takes any
+    keep_clusters: int = 50  # largest connected pieces that stay (2DGS); 0: all
+    min_triangles: int = 50  # pieces with fewer go in any case (2DGS)
+    max_blocks: int = 400_000  # of 8^3 voxels, 8 GB at the end; beyond it the fusion stops with an error
+
+
+@dataclass(frozen=True)
+class HullSettings:
+    """Numbers of the carving; measured in docs/mesh.md."""
+
+    voxels: int = 96  # along the longest side of the object
+    outvoted: int = AUTOMATIC  # k: masks that may be wrong about a point; -1: what agrees best with most masks
+    tie: float = 0.004  # a larger k must raise the median silhouette IoU by more than this
+    explained: float = 0.98  # median IoU from which on nothing opaque is thought to hide parts of the object
+    min_seen: float = 0.4  # share of the views that must have a point in the picture for it to belong to the object
+    smoothing: int = 10  # iterations of Taubin's filter
+    trim: bool = True  # cut off what the base set's depth shows to lie behind other surfaces (the unseen bottom)
+    trim_views: int = 8  # views in front of whose depth a point must lie to stay
+    trim_margin: float = 0.5  # voxels that it may lie behind it
+    min_piece: float = 0.05  # pieces with a smaller share of the largest one's volume go
+    min_views: int = 12  # masks; with fewer the hull is not chosen by mesh.source = auto
+    min_spread: float = 60.0  # degrees between the two farthest views; with less the hull is not chosen either
+
+
+@dataclass(frozen=True)
+class PaneSettings:
+    """When one plane counts as an explanation of the masks."""
+
+    agree: float = 0.9  # silhouette IoU over the training views a pane needs
+    better: float = 0.02  # IoU by which a hull, where there can be one, must beat it
+    min_views: int = 3
+    min_spread: float = 10.0  # degrees between the two farthest views: below, every plane explains them
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,8 @@ from torch import Tensor
 from rtgs.cameras import Camera
 from rtgs.errors import RtgsError
 from rtgs.mesh.guide import MeshGuide
+from rtgs.mesh.settings import COVERED
 from rtgs.mesh.triangles import TriangleMesh
-
-COVERED = 0.999  # share of the picture from which on a mask says that everything is the object
 
 
 def bounding(mask: Tensor | None) -> Tensor | None:

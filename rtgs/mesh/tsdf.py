@@ -17,26 +17,10 @@ from torch import Tensor
 
 from rtgs.cameras import Camera
 from rtgs.errors import RtgsError
+from rtgs.mesh.settings import TsdfSettings
 from rtgs.mesh.triangles import TriangleMesh
 
 BLOCK = 8  # voxels along the side of a block
-
-
-@dataclass(frozen=True)
-class TsdfSettings:
-    """Numbers of the fusion. Lengths in world units; 0 means derived, as its comment says."""
-
-    depth_trunc: float = 0.0  # depths beyond it are ignored; 0: depth_trunc_radii * radius of the cameras
-    depth_trunc_radii: float = 2.0  # 2DGS bounded mode
-    voxel: float = 0.0  # 0: depth_trunc / resolution
-    resolution: int = 1024  # 2DGS
-    finest_pixels: float = 1.0  # a derived voxel is no finer than this many pixels seen from the radius; 0: as 2DGS
-    truncation_voxels: float = 5.0  # 2DGS
-    min_alpha: float = 0.5  # depths of pixels with less alpha are ignored (2DGS, its mask rule)
-    min_weight: float = 1.0  # observations a voxel needs to carry surface; 2DGS takes any
-    keep_clusters: int = 50  # largest connected pieces that stay (2DGS); 0: all
-    min_triangles: int = 50  # pieces with fewer go in any case (2DGS)
-    max_blocks: int = 400_000  # of 8^3 voxels, 8 GB at the end; beyond it the fusion stops with an error
 
 
 @dataclass(frozen=True)
@@ -86,9 +70,7 @@ def focus_region(cameras: Sequence[Camera]) -> FocusRegion:
     return FocusRegion(center, float(np.linalg.norm(centers - center, axis=1).min()))
 
 
-def fuse_depths(
-    views: Iterable[DepthView], cameras: Sequence[Camera], settings: TsdfSettings = TsdfSettings()
-) -> MeshResult:
+def fuse_depths(views: Iterable[DepthView], cameras: Sequence[Camera], settings: TsdfSettings) -> MeshResult:
     """Fuse the views and extract the mesh; views are taken one by one, and only depth and 8-bit image of each are kept.
 
     ``cameras``: those of the views, from which lengths are derived where the settings say 0. The mesh has colours when

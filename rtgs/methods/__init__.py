@@ -1,10 +1,8 @@
-"""The systems of the tables: one file each, created by the name that the config gives."""
+"""The systems of the tables: one file each, created by the name that the config gives. Loads no torch by itself."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
-
-import torch
 
 from rtgs.methods.base import (
     Decision,
@@ -17,15 +15,15 @@ from rtgs.methods.base import (
     Stage,
     StepEvent,
 )
-from rtgs.methods.stages import stage_settings
+from rtgs.methods.stages import METHOD_NAMES, check_name, has_third_stage, method_stages, stage_settings
 from rtgs.train.settings import MethodSettings, ScheduleSettings
 
 if TYPE_CHECKING:
+    import torch
+
     from rtgs.mesh.container import ObjectMesh
     from rtgs.methods.surfel_base import SurfelMethod
     from rtgs.scenes.scene import Scene
-
-METHOD_NAMES = ("2dgs", "3dgs", "envgs", "rtgs")
 
 
 def create_method(
@@ -55,29 +53,8 @@ def create_method(
     return kind(settings, scene, schedule, generator, object_mesh)
 
 
-def has_third_stage(settings: MethodSettings) -> bool:
-    """Whether the method ``settings.name`` has a stage for transparent objects, and it is switched on."""
-    return settings.name == "rtgs" and settings.transmittance.enabled
-
-
-def method_stages(
-    settings: MethodSettings, schedule: ScheduleSettings, *, transparent: bool = False
-) -> tuple[Stage, ...]:
-    """The stages that the method ``settings.name`` goes through under ``schedule``, in order.
-
-    ``transparent``: the scene has a transparent object (masks that are not empty).
-
-    Raises:
-        ValueError: no method has this name, or the stages are out of order.
-    """
-    if transparent and has_third_stage(settings):
-        from rtgs.methods.transmittance import TransmissiveMethod
-
-        return TransmissiveMethod.declare_stages(settings, schedule, transparent=True)
-    return _method_class(settings).declare_stages(settings, schedule)
-
-
 def _method_class(settings: MethodSettings) -> type[SurfelMethod]:
+    check_name(settings)
     if settings.name == "2dgs":
         from rtgs.methods.gs2d import Gs2d
 
@@ -90,11 +67,9 @@ def _method_class(settings: MethodSettings) -> type[SurfelMethod]:
         from rtgs.methods.envgs import EnvGs
 
         return EnvGs
-    if settings.name == "rtgs":
-        from rtgs.methods.rtgs import RtGs
+    from rtgs.methods.rtgs import RtGs
 
-        return RtGs
-    raise ValueError(f"method.name is {settings.name!r}: choose one of {', '.join(METHOD_NAMES)}")
+    return RtGs
 
 
 __all__ = [

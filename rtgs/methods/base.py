@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
-from torch import Tensor
-
-from rtgs.cameras import Camera
-from rtgs.render.buffers import RasterBuffers
 from rtgs.train.settings import MethodSettings, ScheduleSettings
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
+    from rtgs.cameras import Camera
     from rtgs.methods.surfel_set import SurfelSet
+    from rtgs.render.buffers import RasterBuffers
     from rtgs.scenes.scene import View
 
 

@@ -19,6 +19,7 @@ from rtgs.methods.glass_evidence import glass_faces, masked_views, on_surface, s
 from rtgs.methods.interface_set import InterfaceSet, interface_surfels
 from rtgs.methods.reflection_set import ReflectionSet
 from rtgs.methods.reflective import ReflectiveMethod
+from rtgs.methods.stages import method_stages
 from rtgs.methods.traced_set import FollowingTree
 from rtgs.methods.transmittance_set import initial_box, random_surfels, rows_inside, take_out
 from rtgs.train.schedule import reflection_plan, transmittance_plan
@@ -60,35 +61,11 @@ class GlassStage(ReflectiveMethod):
         self._masked = any(bool(mask.any()) for _, mask in masked_views(scene.train))
         if object_mesh is not None and settings.transmittance.enabled:
             self.guide = ObjectGuide(object_mesh)
-            self.stages = self.declare_stages(settings, schedule, transparent=True)
+            self.stages = method_stages(settings, schedule, transparent=True)
             self.base_schedule = self.through.base
             plan = reflection_plan(settings.reflection, self.base_schedule)
             frozen = min(plan.propagation_until, self.through.start)
             self.plan = replace(plan, propagation_until=frozen) if settings.transmittance.freeze_base else plan
-
-    @staticmethod
-    def declare_stages(
-        settings: MethodSettings, schedule: ScheduleSettings, transparent: bool = False
-    ) -> tuple[Stage, ...]:
-        """The stages of a run; the third is of scenes with a ``transparent`` object only.
-
-        Raises:
-            ValueError: the third stage would start before the second.
-        """
-        stages = ReflectiveMethod.declare_stages(settings, schedule)
-        start = transmittance_plan(settings.transmittance, schedule).start
-        if not (transparent and settings.transmittance.enabled and stages[-1].name == "reflection"):
-            return stages
-        if start >= schedule.total:
-            return stages
-        if start <= stages[-1].from_step:
-            raise ValueError(
-                f"method.transmittance.start={settings.transmittance.start:g} is step {start} of {schedule.total}, but "
-                f"the reflection stage before it starts at step {stages[-1].from_step} "
-                f"(method.reflection.start={settings.reflection.start:g}): let it start later"
-            )
-        third = Stage("transmittance", start, schedule.total)
-        return (*stages[:-1], replace(stages[-1], until=start), third)
 
     @property
     def sets(self):

@@ -83,15 +83,6 @@ class ReflectiveMethod(SurfelMethod):
         self._views = scene.train
         self._sky = scene_color(settings.reflection.background, (view.image for view in scene.train))
 
-    @staticmethod
-    def declare_stages(settings: MethodSettings, schedule: ScheduleSettings) -> tuple[Stage, ...]:
-        start = reflection_plan(settings.reflection, schedule).start
-        if start >= schedule.total:
-            return (Stage("diffuse", 0, schedule.total),)
-        if start == 0:
-            return (Stage("reflection", 0, schedule.total),)
-        return (Stage("diffuse", 0, start), Stage("reflection", start, schedule.total))
-
     @property
     def sets(self):
         return (self.base,) if self.reflection is None else (self.base, self.reflection)

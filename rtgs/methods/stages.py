@@ -1,22 +1,76 @@
-"""What a stage reads of a method's settings: runs that differ only in the rest share the stage."""
+"""Which stages a method goes through, and what each reads of its settings: runs that differ in the rest share it.
+
+Without torch: a plan is made from the cache alone.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
+from rtgs.methods.base import Stage
 from rtgs.optics.settings import OpticsSettings
+from rtgs.train.schedule import reflection_plan, transmittance_plan
 from rtgs.train.settings import (
     LossSettings,
     MethodSettings,
     OptimizerSettings,
     ReflectionSettings,
+    ScheduleSettings,
     TransmittanceSettings,
 )
 from rtgs.train.specular_settings import MaterialSettings
 
+METHOD_NAMES = ("2dgs", "3dgs", "envgs", "rtgs")
+_OF_ONE_STAGE = ("2dgs", "3dgs")
 _SECOND_STAGE_LOSSES = ("perceptual", "specular")
 _THIRD_STAGE_LOSSES = ("transmission_depth",)
 _MATERIAL_RATES = ("specular_logits", "roughness_logits", "f0_logits")
+
+
+def check_name(settings: MethodSettings) -> None:
+    """Refuse a method that does not exist.
+
+    Raises:
+        ValueError: no method has the name ``settings.name``.
+    """
+    if settings.name not in METHOD_NAMES:
+        raise ValueError(f"method.name is {settings.name!r}: choose one of {', '.join(METHOD_NAMES)}")
+
+
+def has_third_stage(settings: MethodSettings) -> bool:
+    """Whether the method ``settings.name`` has a stage for transparent objects, and it is switched on."""
+    return settings.name == "rtgs" and settings.transmittance.enabled
+
+
+def method_stages(
+    settings: MethodSettings, schedule: ScheduleSettings, *, transparent: bool = False
+) -> tuple[Stage, ...]:
+    """The stages that the method ``settings.name`` goes through under ``schedule``, in order: one pipeline step each.
+
+    ``transparent``: the scene has a transparent object (masks that are not empty).
+
+    Raises:
+        ValueError: no method has this name, or the third stage would start before the second.
+    """
+    check_name(settings)
+    second = schedule.total if settings.name in _OF_ONE_STAGE else reflection_plan(settings.reflection, schedule).start
+    if second >= schedule.total:
+        return (Stage("diffuse", 0, schedule.total),)
+    third = schedule.total
+    if transparent and has_third_stage(settings):
+        third = min(transmittance_plan(settings.transmittance, schedule).start, schedule.total)
+    if third <= second:
+        raise ValueError(
+            f"method.transmittance.start={settings.transmittance.start:g} is step {third} of {schedule.total}, but "
+            f"the reflection stage before it starts at step {second} "
+            f"(method.reflection.start={settings.reflection.start:g}): let it start later"
+        )
+    stages = (
+        Stage("diffuse", 0, second),
+        Stage("reflection", second, third),
+        Stage("transmittance", third, schedule.total),
+    )
+    return tuple(stage for stage in stages if stage.from_step < stage.until)
 
 
 def stage_settings(settings: MethodSettings, stage: str) -> MethodSettings:

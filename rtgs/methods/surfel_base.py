@@ -15,6 +15,7 @@ from rtgs.gaussians.primitives import Gaussians
 from rtgs.gaussians.surfels import ActivatedSurfels, Surfels
 from rtgs.methods.base import Decision, LossTerm, LossTerms, RenderedView, RenderOptions, Stage, StepEvent
 from rtgs.methods.pixel_bound import bound_by_pixels
+from rtgs.methods.stages import method_stages
 from rtgs.methods.surfel_set import SurfelSet
 from rtgs.render.buffers import RasterBuffers, RasterOptions
 from rtgs.render.rasterize import rasterize_surfels
@@ -86,15 +87,10 @@ class SurfelMethod:
             means_lr_steps=schedule.means_lr_steps,
             extent=scene.extent,
         )
-        self.stages = self.declare_stages(settings, schedule)
+        self.stages = method_stages(settings, schedule)
         self.starts, decisions = _decide_losses(settings, scene, schedule)
         self.decisions: tuple[Decision, ...] = (*decisions, *_decide_density(settings, schedule), *lowered)
         self._background = torch.tensor(settings.render.background)
-
-    @staticmethod
-    def declare_stages(settings: MethodSettings, schedule: ScheduleSettings) -> tuple[Stage, ...]:
-        """The stages of a run with these settings, known before any scene is: one pipeline step each."""
-        return (Stage("diffuse", 0, schedule.total),)
 
     @property
     def sets(self) -> tuple[SurfelSet, ...]:

@@ -18,8 +18,8 @@ from rtgs.prepare.progress import Say, Ticker
 from rtgs.scenes.capture import CaptureView
 from rtgs.scenes.images import nearest_resize, read_mask, read_photo
 from rtgs.scenes.importers import read_capture
-from rtgs.scenes.scene import select_views
 from rtgs.scenes.settings import SceneSettings
+from rtgs.scenes.splits import select_views
 
 MASKS_DIR = "masks"
 _SMALL = 0.1  # share that a mask may miss of the hull's silhouette and is not filled up: its holes may be true

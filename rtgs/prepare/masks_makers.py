@@ -26,8 +26,8 @@ from rtgs.prepare.masks_segment import Segmenter
 from rtgs.prepare.masks_settings import MaskSettings
 from rtgs.prepare.onnx import Network
 from rtgs.prepare.weights import REGISTRY, check_noted_digest, find_weights
-from rtgs.scenes.canonical import content_hash
 from rtgs.scenes.capture import Capture, CaptureView, list_some
+from rtgs.scenes.digest import content_hash
 from rtgs.scenes.images import image_size, nearest_resize, read_mask, read_photo, same_aspect
 from rtgs.scenes.undistort import project, unproject
 

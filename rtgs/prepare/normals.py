@@ -27,12 +27,12 @@ from rtgs.prepare.onnx import Network
 from rtgs.prepare.progress import Say, Ticker
 from rtgs.prepare.settings import NormalSettings
 from rtgs.prepare.weights import REGISTRY, PretrainedFile, check_noted_digest, find_weights
-from rtgs.scenes.canonical import content_hash
 from rtgs.scenes.capture import Capture, CaptureView
+from rtgs.scenes.digest import content_hash
 from rtgs.scenes.images import area_resize, read_photo
 from rtgs.scenes.importers import read_capture
-from rtgs.scenes.scene import select_views
 from rtgs.scenes.settings import SceneSettings
+from rtgs.scenes.splits import select_views
 from rtgs.scenes.undistort import Lens
 
 REPORT_FILE = "normals.json"

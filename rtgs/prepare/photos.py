@@ -12,9 +12,9 @@ import numpy as np
 from PIL import Image, ImageOps
 
 from rtgs.prepare.errors import PrepareError
-from rtgs.scenes.canonical import content_hash
 from rtgs.scenes.capture import Finding, existing_side_file, list_some
 from rtgs.scenes.colmap import IMAGE_FOLDERS
+from rtgs.scenes.digest import content_hash
 from rtgs.scenes.images import IMAGE_SUFFIXES, MASK_SUFFIXES, nearest_resize, read_mask, read_photo, same_aspect
 from rtgs.scenes.settings import CaptureError
 

@@ -16,7 +16,7 @@ from rtgs.scenes.capture import Capture, CaptureView, Finding, existing_side_fil
 from rtgs.scenes.images import MASK_SUFFIXES, NORMAL_SUFFIXES
 from rtgs.scenes.settings import CaptureError, SceneSettings
 from rtgs.scenes.transforms import locate_image, read_json, size_on_disk, world_to_camera
-from rtgs.scenes.truth import existing_truth
+from rtgs.scenes.truth_files import existing_truth
 from rtgs.scenes.undistort import Lens
 
 RANDOM_BOX = 1.3

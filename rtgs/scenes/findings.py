@@ -7,7 +7,7 @@ from collections import Counter
 import numpy as np
 
 from rtgs.scenes.capture import Capture, CaptureView, Finding, list_some
-from rtgs.scenes.truth import truth_files
+from rtgs.scenes.truth_files import truth_files
 from rtgs.scenes.undistort import check_lens
 
 _FEW_VIEWS = 8

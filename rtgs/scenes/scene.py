@@ -26,7 +26,7 @@ from rtgs.scenes.images import (
 from rtgs.scenes.importers import read_capture
 from rtgs.scenes.points import camera_extent, filter_points, random_points, too_few_points
 from rtgs.scenes.settings import CaptureError, SceneSettings
-from rtgs.scenes.splits import choose_split
+from rtgs.scenes.splits import choose_split, select_views
 from rtgs.scenes.synthetic.record import CaptureRecord
 from rtgs.scenes.truth import ViewTruth, read_truth
 from rtgs.scenes.undistort import Lens, undistort_image, undistort_nearest
@@ -142,15 +142,6 @@ def load_scene(settings: SceneSettings) -> Scene:
     )
     log.info("%s", scene.summary())
     return scene
-
-
-def select_views(capture: Capture, settings: SceneSettings) -> list[CaptureView]:
-    """The views in name order, thinned evenly to ``max_views``."""
-    views = list(capture.views)
-    if settings.max_views is None or settings.max_views >= len(views):
-        return views
-    chosen = np.unique(np.round(np.linspace(0, len(views) - 1, settings.max_views)).astype(int))
-    return [views[index] for index in chosen]
 
 
 def _scene_points(

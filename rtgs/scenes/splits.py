@@ -1,4 +1,4 @@
-"""Which views are for training and which for testing (methods.md 8.1)."""
+"""Which views are used, and which of them are for training and which for testing (methods.md 8.1)."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ import json
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from rtgs.scenes.capture import Capture, list_some
+import numpy as np
+
+from rtgs.scenes.capture import Capture, CaptureView, list_some
 from rtgs.scenes.settings import CaptureError, SceneSettings
 
 
@@ -17,6 +19,15 @@ class Split:
     train: tuple[str, ...]
     test: tuple[str, ...]
     rule: str  # how it was decided, for the log and the report
+
+
+def select_views(capture: Capture, settings: SceneSettings) -> list[CaptureView]:
+    """The views in name order, thinned evenly to ``max_views``."""
+    views = list(capture.views)
+    if settings.max_views is None or settings.max_views >= len(views):
+        return views
+    chosen = np.unique(np.round(np.linspace(0, len(views) - 1, settings.max_views)).astype(int))
+    return [views[index] for index in chosen]
 
 
 def choose_split(capture: Capture, names: list[str], settings: SceneSettings) -> Split:

@@ -15,7 +15,7 @@ import numpy as np
 from rtgs.scenes.capture import Capture, CaptureView, Finding, PointCloud, existing_side_file
 from rtgs.scenes.images import IMAGE_SUFFIXES, MASK_SUFFIXES, NORMAL_SUFFIXES, image_size
 from rtgs.scenes.settings import CaptureError, SceneSettings
-from rtgs.scenes.truth import existing_truth
+from rtgs.scenes.truth_files import existing_truth
 from rtgs.scenes.undistort import Lens
 
 TRANSFORMS_FILE = "transforms.json"

@@ -23,8 +23,8 @@ from torch import Tensor
 
 from rtgs.scenes.images import nearest_resize
 from rtgs.scenes.settings import CaptureError
+from rtgs.scenes.truth_files import truth_files
 
-TRUTH_FOLDER = "truth"
 LAYERS = ("diffuse", "reflected", "transmitted")
 _DEPTHS = ("depth", "second_depth")
 _DEPTH_LEVELS = 8191  # finer ones would be half of a shipped capture's truth, and say nothing that 13 bits do not
@@ -122,17 +122,6 @@ def _save(path: Path, pixels: np.ndarray, scale: float | None = None) -> None:
     if scale is not None:
         chunk.add_text("scale", repr(scale))
     Image.fromarray(pixels).save(path, optimize=True, pnginfo=chunk)
-
-
-def truth_files(folder: Path) -> tuple[Path, ...]:
-    """The files :func:`read_truth` reads."""
-    return tuple(folder / f"{field.name}.png" for field in fields(ViewTruth))
-
-
-def existing_truth(root: Path, image_name: str) -> Path | None:
-    """The truth folder of an image of a capture; None where there is none."""
-    folder = root / TRUTH_FOLDER / Path(image_name).with_suffix("")
-    return folder if folder.is_dir() else None
 
 
 def read_truth(folder: Path) -> ViewTruth:

@@ -11,8 +11,8 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, fields, is_dataclass
 from pathlib import Path
 
 from safetensors import SafetensorError
@@ -193,11 +193,10 @@ def check_resumable(record: CheckpointRecord, now: CheckpointRecord, *, warn: Ca
     Raises:
         CheckpointError: other settings or another scene: going on would mix two experiments.
     """
-    if record.settings_digest != now.settings_digest:
+    if record.settings_digest != now.settings_digest and (differences := _differences(record.settings, now.settings)):
         raise CheckpointError(
-            "the checkpoint was written with other settings: "
-            + "; ".join(_differences(record.settings, now.settings))
-            + ". Use the same settings, or another output folder"
+            f"the checkpoint was written with other settings: {'; '.join(differences)}. Use the same settings, or "
+            "another output folder"
         )
     if record.scene_digest != now.scene_digest:
         raise CheckpointError(
@@ -229,10 +228,21 @@ def _differences(old: str, new: str) -> list[str]:
             return {prefix: value}
         return {key: leaf for name, child in items for key, leaf in flat(child, f"{prefix}.{name}".lstrip(".")).items()}
 
-    before, after = flat(json.loads(old)), flat(json.loads(new))
+    added = dict(_added_settings(RunSettings(MethodSettings(), ScheduleSettings(), 0)))
+    before, after = ({**added, **flat(json.loads(text))} for text in (old, new))
     keys = [key for key in sorted(before.keys() | after.keys()) if before.get(key) != after.get(key)]
     shown = [f"{key}: {before.get(key)} then, {after.get(key)} now" for key in keys[:5]]
     return shown + ([f"and {len(keys) - 5} more"] if len(keys) > 5 else [])
+
+
+def _added_settings(value: object, prefix: str = "") -> Iterator[tuple[str, object]]:
+    """Keys that settings did not have once, with the default that says what was done then (``recipe: unless default``,
+    :data:`rtgs.pipeline.fingerprint.UNLESS_DEFAULT`): a run that an older version began goes on."""
+    for item in fields(value) if is_dataclass(value) else ():
+        key, inner = f"{prefix}{item.name}", getattr(value, item.name)
+        if item.metadata.get("recipe") == "unless default":
+            yield key, item.default
+        yield from _added_settings(inner, f"{key}.")
 
 
 def _steps(folder: Path) -> list[int]:

@@ -32,8 +32,8 @@ from rtgs.train.clock import Clock, ElapsedTime
 from rtgs.train.guard import check_loss, diverged
 from rtgs.train.memory import peak_memory_mb, start_peak_memory
 from rtgs.train.progress import Progress, SilentProgress, StepReport
-from rtgs.train.schedule import OrderState, ViewOrder
 from rtgs.train.seeds import seed_for
+from rtgs.train.view_order import OrderState, ViewOrder
 
 REPORT_EVERY = 10  # steps between looks at the PSNR of a training view
 RECORD_EVERY = 50  # steps between batches of metrics

@@ -177,6 +177,18 @@ def test_missing_weights_say_where_to_get_them(tmp_path: Path, monkeypatch: pyte
     assert all("weights missing" in status.problem for status in report)
 
 
+@pytest.mark.parametrize("variable", ["TORCH_HOME", "XDG_CACHE_HOME", None])
+def test_torchs_own_cache_is_found_without_asking_torch(
+    variable: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("TORCH_HOME", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    if variable:
+        monkeypatch.setenv(variable, str(tmp_path))
+    monkeypatch.setattr(torch.hub, "_hub_dir", None)
+    assert pretrained.weight_folders()[-1] == Path(torch.hub.get_dir()) / "checkpoints"
+
+
 def test_search_order_and_verification(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("RTGS_WEIGHTS", str(tmp_path))
     monkeypatch.setenv("RTGS_SHARED", str(tmp_path / "shared"))

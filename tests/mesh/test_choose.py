@@ -9,9 +9,8 @@ import torch
 
 from rtgs.errors import RtgsError
 from rtgs.mesh.choose import Choice, choose_object_mesh, read_given
-from rtgs.mesh.hull import HullSettings
 from rtgs.mesh.pane import drawn_pane, fit_pane, is_flat
-from rtgs.mesh.settings import ObjectSettings
+from rtgs.mesh.settings import HullSettings, ObjectSettings
 from rtgs.mesh.silhouettes import MaskSet, mask_set
 from rtgs.mesh.triangles import TriangleMesh, read_mesh_obj, write_mesh_obj, write_mesh_ply
 from tests.mesh.shapes import box, camera_at, pane, sphere

@@ -17,10 +17,8 @@ from rtgs.cameras import Camera
 from rtgs.config.schema import MeshConfig, RunConfig
 from rtgs.errors import RtgsError
 from rtgs.mesh.container import read_object_mesh
-from rtgs.mesh.hull import HullSettings
-from rtgs.mesh.settings import ObjectSettings
+from rtgs.mesh.settings import HullSettings, ObjectSettings, TsdfSettings
 from rtgs.mesh.triangles import TriangleMesh, read_mesh_ply, write_mesh_ply
-from rtgs.mesh.tsdf import TsdfSettings
 from rtgs.methods import RenderedView, RenderOptions
 from rtgs.pipeline import StepContext
 from rtgs.render.buffers import RasterBuffers

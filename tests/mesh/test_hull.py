@@ -11,8 +11,9 @@ from rtgs.cameras import Camera
 from rtgs.errors import RtgsError
 from rtgs.mesh.container import ObjectMesh
 from rtgs.mesh.guide import MeshGuide
-from rtgs.mesh.hull import HullSettings, carve_hull, most_outvoted
+from rtgs.mesh.hull import carve_hull, most_outvoted
 from rtgs.mesh.score import hit_score, mesh_distance, triangle_distance
+from rtgs.mesh.settings import HullSettings
 from rtgs.mesh.silhouettes import MaskSet, direction_spread, focus_point, mask_set, silhouette_score
 from rtgs.mesh.smoothing import main_pieces, surface_of_field, taubin, volume
 from rtgs.mesh.triangles import TriangleMesh

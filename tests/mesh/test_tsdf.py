@@ -9,11 +9,11 @@ import torch
 
 from rtgs.cameras import Camera
 from rtgs.errors import RtgsError
+from rtgs.mesh.settings import TsdfSettings
 from rtgs.mesh.triangles import TriangleMesh, read_mesh_ply, write_mesh_obj, write_mesh_ply
 from rtgs.mesh.tsdf import (
     DepthView,
     MeshResult,
-    TsdfSettings,
     blocks_near_surface,
     focus_region,
     fuse_depths,
@@ -133,7 +133,7 @@ def test_what_cannot_be_fused_is_explained() -> None:
     with pytest.raises(RtgsError, match="nothing to fuse"):
         fused([DepthView(view.camera, torch.zeros_like(view.depth))], TsdfSettings(depth_trunc=6.0))
     with pytest.raises(RtgsError, match="no training views"):
-        fuse_depths([], [])
+        fuse_depths([], [], TsdfSettings())
     with pytest.raises(ValueError, match="either every view has an image or none"):
         fused([view, DepthView(view.camera, view.depth)], TsdfSettings(depth_trunc=6.0, voxel=0.1))
     with pytest.raises(RtgsError, match="max_blocks is 10"):

@@ -361,6 +361,17 @@ def test_the_module_is_the_same_as_the_command(first, words):
     assert "nothing to do" in result.stderr
 
 
+def test_planning_loads_nothing_that_takes_seconds(root):
+    """A table that is all there is shown again in seconds: no torch, no tracker, no cluster."""
+    code = (
+        "import sys; from pipelines.cli import main; assert main(sys.argv[1:]) == 0; "
+        "print('loaded', sorted({'torch', 'mlflow', 'distributed', 'cv2', 'skimage', 'scipy'} & set(sys.modules)))"
+    )
+    words = ["plan", "--multirun", "experiment=table3", "preset=smoke"]
+    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "loaded []"
+
+
 def test_a_killed_training_goes_on_and_ends_the_same(words, first, root, tmp_path, monkeypatch, capsys):
     longer = [*words, "schedule.total=200", "schedule.checkpoint_every=20", "name=long"]
     assert main(longer) == 0

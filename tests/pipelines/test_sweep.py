@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -55,6 +56,10 @@ def _in_root(tmp_path, monkeypatch):
     logging.root.handlers[:], logging.root.level = handlers, level
 
 
+def _recorded(root: Path) -> int:
+    return len(list((root / "tracking").rglob("events.jsonl")))
+
+
 def test_a_sweep_is_one_plan_and_every_job_has_its_results(capture, tmp_path, capsys):
     words = [
         "run",
@@ -104,10 +109,13 @@ def test_a_sweep_is_one_plan_and_every_job_has_its_results(capture, tmp_path, ca
 
     assert main(words) == 0
     assert "17 steps, 17 from the cache, nothing to do" in capsys.readouterr().err
-    again = [
-        path for path in (tmp_path / "tracking").rglob("events.jsonl") if not path.parent.name.startswith("sweep_")
-    ]
-    assert len(again) == len(starts) - 1  # no job is recorded twice; only the table goes to the new sweep
+    assert _recorded(tmp_path) == len(starts)  # no job is recorded twice, and no sweep that has nothing new
+
+    shutil.rmtree(next(iter(store.artifacts("report"))).folder)
+    assert main(words) == 0
+    assert "17 steps, 16 from the cache" in capsys.readouterr().err
+    (other,) = {*(tmp_path / "tracking" / "rtgs-runs").glob("sweep_*")} - {group}
+    assert (other / "artifacts" / "table.md").read_text() == table  # a sweep with something new has its table
 
     assert main(["plan", *jobs, "method.loss.l1=0.8,0.7"]) == 0
     lines = capsys.readouterr().out.splitlines()

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from rtgs.scenes.canonical import capture_digest, read_scene, save_scene
+from rtgs.scenes.canonical import read_scene, save_scene
 from rtgs.scenes.capture import CaptureError
+from rtgs.scenes.digest import capture_digest
 from rtgs.scenes.scene import load_scene
 from rtgs.scenes.settings import SceneSettings
 

@@ -1,16 +1,18 @@
 """The truth of a view: written, read, shrunk, carried by the importer and the cached scene."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
-from rtgs.scenes.canonical import capture_digest, read_scene, save_scene
+from rtgs.scenes.canonical import read_scene, save_scene
+from rtgs.scenes.digest import capture_digest
 from rtgs.scenes.scene import load_scene
 from rtgs.scenes.settings import CaptureError, SceneSettings
 from rtgs.scenes.truth import LAYERS, ViewTruth, linear_from_srgb, read_truth, srgb_from_linear, write_truth
+from rtgs.scenes.truth_files import TRUTH_MAPS, truth_files
 
 SIZE = (24, 32)
 
@@ -28,6 +30,12 @@ def drawn_truth(seed: int = 0, size: tuple[int, int] = SIZE, brightest: float = 
     objects = torch.where(known, (uniform(height, width) * 20).short(), torch.tensor(-1, dtype=torch.int16))
     lights = {name: brightest * uniform(3, height, width) ** 2 for name in LAYERS}
     return ViewTruth(depth, depth * 1.3, normal, objects, (uniform(height, width) > 0.5) & known, **lights)
+
+
+def test_every_map_of_a_view_has_its_file(tmp_path):
+    assert tuple(field.name for field in fields(ViewTruth)) == TRUTH_MAPS
+    write_truth(tmp_path, drawn_truth())
+    assert {*truth_files(tmp_path)} == {*tmp_path.iterdir()}
 
 
 def test_what_is_read_is_what_was_written_within_the_documented_error(tmp_path):

@@ -183,6 +183,21 @@ def test_other_settings_are_refused_by_key():
         check_resumable(make(settings=base).record, make(settings=other).record, warn=pytest.fail)
 
 
+def test_a_setting_that_is_new_since_the_checkpoint_counts_as_its_default():
+    record = make(settings=RunSettings(MethodSettings(), ScheduleSettings(), 0)).record
+    old = json.loads(record.settings)
+    assert old["method"]["optics"].pop("blend") == "srgb"
+    before = replace(record, settings=json.dumps(old, sort_keys=True), settings_digest="another")
+    check_resumable(before, record, warn=pytest.fail)
+    check_resumable(record, before, warn=pytest.fail)
+    other = replace(record, settings=record.settings.replace('"srgb"', '"linear"'), settings_digest="a third")
+    with pytest.raises(CheckpointError, match=r"method\.optics\.blend: srgb then, linear now"):
+        check_resumable(before, other, warn=pytest.fail)
+    del old["method"]["optics"]["weight"]
+    with pytest.raises(CheckpointError, match=r"method\.optics\.weight: None then"):  # not marked as a later one
+        check_resumable(replace(before, settings=json.dumps(old)), record, warn=pytest.fail)
+
+
 def test_another_scene_is_refused():
     record = make().record
     with pytest.raises(CheckpointError, match="another scene or resolution"):

@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rtgs.train.schedule import (
-    ViewOrder,
     check_schedule,
     densify_ahead,
     densify_due,
@@ -18,6 +17,7 @@ from rtgs.train.schedule import (
 )
 from rtgs.train.seeds import generator_for, seed_for
 from rtgs.train.settings import ScheduleSettings
+from rtgs.train.view_order import ViewOrder
 
 
 def test_densification_runs_inside_the_open_window_of_the_papers():

@@ -33,7 +33,8 @@ from rtgs.scenes.synthetic.render import Geometry, PathTracer
 from rtgs.scenes.synthetic.settings import CaptureSettings
 from rtgs.scenes.synthetic.shrink import shrink_pictures
 from rtgs.scenes.synthetic.viewpoints import cameras as make_cameras
-from rtgs.scenes.truth import TRUTH_FOLDER, ViewTruth, srgb_from_linear, write_truth
+from rtgs.scenes.truth import ViewTruth, srgb_from_linear, write_truth
+from rtgs.scenes.truth_files import TRUTH_FOLDER
 
 _SIDES = {"image": "images", "mask": "masks", "normal": "normals", "truth": TRUTH_FOLDER}
 _NORMAL_LEVELS = 127  # per axis: half a degree, where the estimator errs by some; 8 bits would be noise in the files
