@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rtgs.track.protocol import RunInfo, Scalar, Tracker, as_uint8, identity
+from rtgs.track.protocol import RunInfo, Scalar, Tracker, as_uint8, identity, mark_new
 
 
 class JsonlTracker:
@@ -86,6 +86,7 @@ class JsonlTracking:
         stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%S")
         name = f"{stamp}_{safe_name(info.name)}_{secrets.token_hex(3)}"
         folder = self.root / safe_name(info.experiment) / name
+        self._make_root()
         folder.mkdir(parents=True)
         tracker = JsonlTracker(folder)
         parent = {"parent": info.parent} if info.parent else {}
@@ -105,6 +106,7 @@ class JsonlTracking:
     def sweep(self, info: RunInfo) -> Iterator[Tracker]:
         """The folder ``<root>/<experiment>/sweep_<fingerprint>``, made or continued."""
         folder = self.root / safe_name(info.experiment) / f"sweep_{safe_name(info.fingerprint)}"
+        self._make_root()
         new = not folder.exists()
         folder.mkdir(parents=True, exist_ok=True)
         tracker = JsonlTracker(folder)
@@ -114,6 +116,11 @@ class JsonlTracking:
             yield tracker
         finally:
             tracker.close()
+
+    def _make_root(self) -> None:
+        if not self.root.exists():
+            self.root.mkdir(parents=True, exist_ok=True)
+            mark_new(self.root)
 
     def finished(self, experiment: str, fingerprint: str) -> bool:
         """Whether a finished run of this fingerprint is recorded in this experiment."""

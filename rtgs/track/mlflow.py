@@ -21,7 +21,7 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from rtgs.errors import RtgsError
-from rtgs.track.protocol import RunInfo, Scalar, Tracker, as_uint8, identity
+from rtgs.track.protocol import RunInfo, Scalar, Tracker, as_uint8, identity, mark_new
 
 if TYPE_CHECKING:
     from mlflow.tracking import MlflowClient
@@ -148,6 +148,7 @@ class MlflowTracking:
         MlflowClient(tracking_uri=f"sqlite:///{fresh}").search_experiments(max_results=1)
         with closing(sqlite3.connect(fresh)) as connection:
             connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")  # everything into the one file that is renamed
+        mark_new(self.database)
         os.replace(fresh, self.database)
 
     @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
@@ -80,11 +81,21 @@ class Tracking(Protocol):
 
 
 def identity(path: Path) -> str:
-    """A file or folder that is told from one that takes its place later."""
+    """A file or folder that is told from one that takes its place later (:func:`mark_new`)."""
     try:
-        return f"{path.absolute()} {path.stat().st_ino}"
+        token = _mark(path).read_text(encoding="utf-8") if _mark(path).is_file() else ""
+        return f"{path.absolute()} {path.stat().st_ino} {token}".rstrip()
     except OSError:
         return f"{path.absolute()}, not there"
+
+
+def mark_new(path: Path) -> None:
+    """Give a file or folder that is made now an :func:`identity` of its own: an inode alone may be used again."""
+    _mark(path).write_text(secrets.token_hex(8), encoding="utf-8")
+
+
+def _mark(path: Path) -> Path:
+    return path.with_name(f".{path.name}.id")
 
 
 def as_uint8(array: np.ndarray) -> np.ndarray:

@@ -193,6 +193,17 @@ def test_a_sweep_groups_its_runs_and_is_found_again(tracking, tmp_path):
     assert [item.path for item in tracking.client.list_artifacts(first.id)] == ["table.md"]
 
 
+def test_a_database_made_anew_is_another_place(tmp_path):
+    """The file system may give the new one the inode of the old one."""
+    tracking, places = MlflowTracking(tmp_path), []
+    for _ in range(2):
+        tracking._make_database()
+        places.append(tracking.place)
+        tracking.database.unlink()
+    assert places[0].split()[-1] != places[1].split()[-1]
+    assert all(len(place.split()[-1]) == 16 for place in places)
+
+
 def test_only_finished_runs_count_as_recorded(tracking):
     info = RunInfo("rtgs/recorded", "variant", "d" * 64)
     assert not tracking.finished("rtgs/recorded", "d" * 64)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -38,6 +39,20 @@ def test_off_keeps_nothing(tmp_path):
         assert isinstance(tracker, Tracker)
         log_everything(tracker, tmp_path)
     assert not (tmp_path / "root").exists()
+
+
+def test_a_record_made_anew_is_another_place(tmp_path):
+    """The file system may give the new one the inode of the old one."""
+    places = []
+    for _ in range(2):
+        tracking = open_tracking("jsonl", tmp_path)
+        with tracking.run(INFO):
+            pass
+        places.append(tracking.place)
+        assert open_tracking("jsonl", tmp_path).place == tracking.place
+        shutil.rmtree(tmp_path / "tracking")
+    assert places[0].split()[-1] != places[1].split()[-1]
+    assert all(len(place.split()[-1]) == 16 for place in places)
 
 
 def test_jsonl_writes_every_event(tmp_path):
