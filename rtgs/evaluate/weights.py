@@ -92,9 +92,9 @@ def weight_folders() -> tuple[Path, ...]:
 
 def _torch_cache() -> Path:
     """Where torch keeps what it downloads (``torch.hub``'s documentation), found without loading torch."""
-    if os.environ.get("TORCH_HOME"):
-        return Path(os.environ["TORCH_HOME"]).expanduser()
-    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "torch"
+    cache = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    home = os.environ.get("TORCH_HOME") or os.path.join(cache, "torch")
+    return Path(os.path.expanduser(home))  # unlike Path.expanduser, does not raise for a user without a home
 
 
 def find_weights(file: PretrainedFile, folders: Iterable[Path] | None = None) -> Path:

@@ -7,7 +7,7 @@ import re
 import secrets
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -118,8 +118,8 @@ class JsonlTracking:
             tracker.close()
 
     def _make_root(self) -> None:
-        if not self.root.exists():
-            self.root.mkdir(parents=True, exist_ok=True)
+        with suppress(FileExistsError):  # of several processes, one makes it: a second mark would undo the first
+            self.root.mkdir(parents=True)
             mark_new(self.root)
 
     def finished(self, experiment: str, fingerprint: str) -> bool:

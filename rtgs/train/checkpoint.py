@@ -217,7 +217,7 @@ def check_resumable(record: CheckpointRecord, now: CheckpointRecord, *, warn: Ca
 
 
 def _differences(old: str, new: str) -> list[str]:
-    """The first few settings that differ, as 'key: old then, new now'."""
+    """The first few settings that differ, as 'key: old then, new now'; see :func:`_added_settings` for newer keys."""
 
     def flat(value: object, prefix: str = "") -> dict[str, object]:
         if isinstance(value, dict):
