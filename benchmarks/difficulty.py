@@ -14,7 +14,7 @@ from pathlib import Path
 
 from pipelines import cli
 from pipelines.evaluate import TABLE_JSON
-from rtgs.evaluate.evaluate import EvaluationTable, read_json
+from rtgs.evaluate.records import EvaluationTable, read_json
 from rtgs.scenes.embedded import embedded_capture, embedded_names
 from rtgs.scenes.synthetic.record import CaptureRecord
 

@@ -21,8 +21,8 @@ from pipelines.evaluate import TABLE_JSON
 from pipelines.results import RUN_FILE, RunRecord
 from pipelines.views import read_render
 from rtgs.errors import RtgsError
-from rtgs.evaluate.evaluate import EvaluationTable, read_json
 from rtgs.evaluate.images import ERROR_FULL_SCALE, error_map, to_bytes
+from rtgs.evaluate.records import EvaluationTable, read_json
 from rtgs.report.figures import depth_picture, normal_picture
 from rtgs.scenes.canonical import read_scene
 

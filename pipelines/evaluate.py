@@ -17,7 +17,7 @@ from rtgs.config.schema import EvaluationConfig
 from rtgs.pipeline import StepContext, StepKind
 
 if TYPE_CHECKING:
-    from rtgs.evaluate.surface import ObjectFacts
+    from rtgs.evaluate.records import ObjectFacts
     from rtgs.scenes.scene import Scene
 
 TABLE_JSON = "metrics.json"
@@ -41,15 +41,8 @@ class EvaluateParams:
 
 def evaluate(params: EvaluateParams, context: StepContext) -> None:
     """Write ``metrics.json``, ``metrics.csv`` and ``errors/<stem>.png``; without test views, tables without rows."""
-    from rtgs.evaluate.evaluate import (
-        NO_TEST_VIEWS,
-        EvaluationSettings,
-        RunFacts,
-        evaluate_views,
-        write_csv,
-        write_error_maps,
-        write_json,
-    )
+    from rtgs.evaluate.evaluate import NO_TEST_VIEWS, EvaluationSettings, evaluate_views, write_error_maps
+    from rtgs.evaluate.records import RunFacts, write_csv, write_json
     from rtgs.scenes.canonical import read_scene
 
     scene = read_scene(context.inputs["import_scene"])
@@ -83,7 +76,8 @@ def evaluate(params: EvaluateParams, context: StepContext) -> None:
 def object_facts(folder: Path, scene: Scene) -> ObjectFacts | None:
     """What is known of the object mesh in an artifact of ``extract_mesh``, with the guide's fallbacks counted; None:
     there is no such object."""
-    from rtgs.evaluate.surface import ObjectFacts, hit_shares
+    from rtgs.evaluate.records import ObjectFacts
+    from rtgs.evaluate.surface import hit_shares
     from rtgs.mesh.container import ObjectGuide, read_object_mesh
     from rtgs.mesh.score import container_mesh
     from rtgs.mesh.silhouettes import bounding
@@ -118,6 +112,7 @@ STEP = StepKind(
     evaluate,
     helpers=(
         "rtgs.evaluate.evaluate",
+        "rtgs.evaluate.records",
         "rtgs.evaluate.layers",
         "rtgs.evaluate.surface",
         "rtgs.mesh.container",

@@ -287,6 +287,7 @@ STEP = StepKind(
         "rtgs.mesh.hull",
         "rtgs.mesh.outlines",
         "rtgs.mesh.pane",
+        "rtgs.mesh.settings",
         "rtgs.mesh.silhouettes",
         "rtgs.mesh.smoothing",
         "rtgs.mesh.tsdf",

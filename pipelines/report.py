@@ -19,7 +19,7 @@ from rtgs.pipeline.manifest import Manifest
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from rtgs.evaluate.evaluate import EvaluationTable
+    from rtgs.evaluate.records import EvaluationTable
     from rtgs.report.figures import Curve
     from rtgs.report.page import Decision, MeshFigure, ReportView, StepLine
 
@@ -42,7 +42,7 @@ class ReportParams:
 
 def report(params: ReportParams, context: StepContext) -> None:
     """Write ``report.html``."""
-    from rtgs.evaluate.evaluate import read_json
+    from rtgs.evaluate.records import read_json
     from rtgs.report.page import ConfigLine, Decision, ReportData, write_report
 
     inputs = context.inputs

@@ -21,6 +21,7 @@ from pipelines.report import PAGE
 from pipelines.training import read_history, stage_params
 from rtgs.config.schema import Choices, RunConfig
 from rtgs.errors import RtgsError
+from rtgs.evaluate.records import METRICS, EvaluationTable, read_json
 from rtgs.pipeline import Plan, StepResult, Store
 from rtgs.prepare.masks_report import FILES as MASK_FILES
 from rtgs.prepare.quality import PICTURE_FILE, REPORT_FILE
@@ -29,7 +30,6 @@ from rtgs.track.source import git_tags, installed
 
 if TYPE_CHECKING:
     from pipelines.preparation import SkippedStep
-    from rtgs.evaluate.evaluate import EvaluationTable
 
 RUN_FILE = "run.json"
 CONFIG_FILE = "config.yaml"
@@ -163,8 +163,6 @@ def config_yaml(config: RunConfig) -> str:
 
 def evaluation_of(results: Sequence[StepResult]) -> EvaluationTable:
     """The measured table of a run."""
-    from rtgs.evaluate.evaluate import read_json
-
     return read_json(folders(results)["evaluate"] / TABLE_JSON)
 
 
@@ -240,8 +238,6 @@ def track_end(tracker: Tracker, folder: Path, results: Sequence[StepResult]) -> 
             for row in read_history(result.folder):
                 step = int(row.pop("step"))
                 tracker.metrics(row, step)
-    from rtgs.evaluate.evaluate import METRICS
-
     table = evaluation_of(results)
     means = {name: table.mean(name) for name in METRICS}
     tracker.metrics({f"eval/{name}": value for name, value in means.items() if value is not None})

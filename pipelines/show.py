@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from rtgs.cameras import Camera
-    from rtgs.evaluate.evaluate import EvaluationTable, TimedRender
+    from rtgs.evaluate.evaluate import TimedRender
+    from rtgs.evaluate.records import EvaluationTable
     from rtgs.gaussians.ellipsoids import Ellipsoids
     from rtgs.gaussians.surfels import Surfels
     from rtgs.scenes.scene import Scene
@@ -94,8 +95,9 @@ def _scene(options: argparse.Namespace) -> Scene:
 
 def _measure(gaussians: Surfels | Ellipsoids, scene: Scene, options: argparse.Namespace, out: Path) -> None:
     """Test views of a capture: renders, error maps, tables."""
-    from rtgs.evaluate.evaluate import RunFacts, TimedRender, evaluate_views, write_csv, write_error_maps, write_json
+    from rtgs.evaluate.evaluate import TimedRender, evaluate_views, write_error_maps
     from rtgs.evaluate.images import file_stem, to_bytes, write_png
+    from rtgs.evaluate.records import RunFacts, write_csv, write_json
 
     transform = _read_transform(options.transform)
     near = min(NEAR, NEAR_SHARE * scene.extent)

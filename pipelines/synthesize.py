@@ -80,7 +80,11 @@ STEP = StepKind(
     "synthesize",
     2,
     synthesize,
-    helpers=("rtgs.scenes.truth", *(f"rtgs.scenes.synthetic.{module}" for module in _MODULES)),
+    helpers=(
+        "rtgs.scenes.truth",
+        "rtgs.scenes.truth_files",
+        *(f"rtgs.scenes.synthetic.{module}" for module in _MODULES),
+    ),
 )
 
 

@@ -2,45 +2,30 @@
 
 from __future__ import annotations
 
-import csv
-import json
-import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
 from torch import Tensor
 
 from rtgs.evaluate.images import ERROR_FULL_SCALE, error_map, error_scale_note, file_stem, write_png
-from rtgs.evaluate.layers import LAYER_METRICS, LayerTruth, layer_scales, layer_scores, why_absent
+from rtgs.evaluate.layers import LayerTruth, layer_scales, layer_scores, why_absent
 from rtgs.evaluate.lpips import InputRange, Lpips, lpips
 from rtgs.evaluate.metrics import psnr, quantized, ssim
-from rtgs.evaluate.surface import SURFACE_METRICS, ObjectFacts, surface_scores
+from rtgs.evaluate.records import (
+    GIVEN_MASK_METRICS,
+    LAYER_METRICS,
+    METRICS,
+    SURFACE_METRICS,
+    EvaluationTable,
+    ObjectFacts,
+    RunFacts,
+    ViewScore,
+)
+from rtgs.evaluate.surface import surface_scores
 from rtgs.evaluate.weights import MissingWeights, WrongWeights
 
-FORMAT = "rtgs-evaluation"
-VERSION = 4  # 2: the layer metrics; 3: transmission, given masks; 4: the surface in the mask, the object's mesh
-# Seen through the test views' own masks instead of the mesh's silhouette (methods.md 7; register row 21).
-GIVEN_MASK_METRICS = ("psnr_given_masks", "psnr_masked_given_masks", "ssim_masked_given_masks")
-# In the order of the columns. Higher is better for psnr*, ssim*, *_share*; lower for lpips*, *_error*, *_degrees*.
-METRICS = (
-    "psnr",
-    "ssim",
-    "lpips_01",
-    "lpips_11",
-    "psnr_masked",
-    "ssim_masked",
-    "lpips_01_masked",
-    "lpips_11_masked",
-    *LAYER_METRICS,
-    *GIVEN_MASK_METRICS,
-    *SURFACE_METRICS,
-    "psnr_8bit",
-    "ssim_8bit",
-    "lpips_01_8bit",
-    "render_seconds",
-)
 NO_TEST_VIEWS = "the scene has no test views; scene.split_every=8 holds out every 8th"
 
 
@@ -77,71 +62,6 @@ class EvaluationSettings:
     lpips: bool = True  # both input conventions, when the weights are on this machine
     masked: bool = True  # inside the mask, for views that have one
     eight_bit: bool = True  # after rounding to 1/255, the protocol of codes that measure saved PNGs
-
-
-@dataclass(frozen=True)
-class RunFacts:
-    """What was measured, printed in every row of the CSV and at the head of the JSON."""
-
-    scene: str
-    method: str
-    preset: str = ""
-    steps: int | None = None
-    surfels: int | None = None
-    train_seconds: float | None = None  # by the wall
-    train_cpu_seconds: float | None = None  # all threads
-    peak_memory_mb: float | None = None
-
-
-@dataclass(frozen=True)
-class ViewScore:
-    """One row. A metric that is None has its reason in :attr:`EvaluationTable.missing`."""
-
-    view: str
-    width: int
-    height: int
-    mask_share: float | None  # share of the pixels inside the mask; None without a mask
-    values: dict[str, float | None]  # keys: METRICS
-
-
-@dataclass(frozen=True)
-class EvaluationTable:
-    """The measured result of one method on one scene."""
-
-    facts: RunFacts
-    rows: tuple[ViewScore, ...]
-    missing: dict[str, str] = field(default_factory=dict)  # metric -> why it is absent (in all views, or in some)
-    reflection_scale: float | None = None  # of psnr_reflection_scaled
-    transmission_scale: float | None = None  # of psnr_transmission_scaled
-    object: ObjectFacts | None = None  # of methods with a third stage, on scenes that have one
-
-    def mean(self, metric: str) -> float | None:
-        """Mean over the views that have the metric; None when none has."""
-        values = self._present(metric)
-        return sum(values) / len(values) if values else None
-
-    def std(self, metric: str) -> float | None:
-        """Population standard deviation over the views that have the metric."""
-        values = self._present(metric)
-        if not values:
-            return None
-        mean = sum(values) / len(values)
-        return math.sqrt(sum((value - mean) ** 2 for value in values) / len(values))
-
-    def count(self, metric: str) -> int:
-        """Views that have the metric."""
-        return len(self._present(metric))
-
-    @property
-    def resolution(self) -> str:
-        """``WxH``, or the range when the views differ; empty without views."""
-        sizes = sorted({(row.width, row.height) for row in self.rows})
-        return " to ".join(f"{width}x{height}" for width, height in dict.fromkeys(sizes[:1] + sizes[-1:]))
-
-    def _present(self, metric: str) -> list[float]:
-        if metric not in METRICS:
-            raise KeyError(f"no metric {metric!r}; there are {', '.join(METRICS)}")
-        return [value for row in self.rows if (value := row.values[metric]) is not None]
 
 
 def load_lpips(settings: EvaluationSettings) -> tuple[Lpips | None, str]:
@@ -262,60 +182,3 @@ def write_error_maps(
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "scale.txt").write_text(error_scale_note(full_scale) + "\n", encoding="utf-8")
     return paths
-
-
-def write_json(path: Path, table: EvaluationTable) -> None:
-    """The whole table; absent figures are null and explained under ``missing``."""
-    document = {
-        "format": FORMAT,
-        "version": VERSION,
-        "facts": asdict(table.facts),
-        "resolution": table.resolution,
-        "mean": {name: table.mean(name) for name in METRICS},
-        "std": {name: table.std(name) for name in METRICS},
-        "count": {name: table.count(name) for name in METRICS},
-        "missing": table.missing,
-        "reflection_scale": table.reflection_scale,
-        "transmission_scale": table.transmission_scale,
-        "object": None if table.object is None else asdict(table.object),
-        "views": [asdict(row) for row in table.rows],
-    }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(document, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-
-
-def read_json(path: Path) -> EvaluationTable:
-    """Read what :func:`write_json` wrote.
-
-    Raises:
-        ValueError: another file, or one of another version.
-    """
-    document = json.loads(path.read_text(encoding="utf-8"))
-    found = (document.get("format"), document.get("version")) if isinstance(document, dict) else (None, None)
-    if found != (FORMAT, VERSION):
-        raise ValueError(f"{path} is not an evaluation: format {found}, expected {(FORMAT, VERSION)}")
-    return EvaluationTable(
-        RunFacts(**document["facts"]),
-        tuple(ViewScore(**row) for row in document["views"]),
-        document["missing"],
-        document["reflection_scale"],
-        document["transmission_scale"],
-        None if document["object"] is None else ObjectFacts(**document["object"]),
-    )
-
-
-def write_csv(path: Path, table: EvaluationTable) -> None:
-    """One line per view, then mean and std; an absent figure is an empty field."""
-    facts = asdict(table.facts)
-    header = ["scene", "method", "preset", "view", "resolution", "mask_share", *METRICS]
-    header += ["steps", "surfels", "train_seconds", "train_cpu_seconds", "peak_memory_mb"]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.DictWriter(stream, header, restval="")
-        writer.writeheader()
-        for row in table.rows:
-            cells = {"view": row.view, "resolution": f"{row.width}x{row.height}", "mask_share": row.mask_share}
-            writer.writerow({**facts, **row.values, **cells})
-        for label, statistic in (("mean", table.mean), ("std", table.std)):
-            cells = {name: statistic(name) for name in METRICS}
-            writer.writerow({**facts, **cells, "view": label, "resolution": table.resolution})

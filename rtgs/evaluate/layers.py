@@ -14,15 +14,11 @@ import torch
 from torch import Tensor
 
 from rtgs.evaluate.metrics import psnr
+from rtgs.evaluate.records import LAYER_METRICS
 from rtgs.evaluate.surface import SurfaceTruth
 from rtgs.scenes.truth import srgb_from_linear
 
 LAYERS = {"reflection": "reflected", "transmission": "transmitted"}  # of a render, by the name of their truth
-LAYER_METRICS = (
-    "psnr_specular",
-    "psnr_diffuse_part",
-    *(f"psnr_{layer}{scaled}" for layer in LAYERS for scaled in ("", "_scaled")),
-)
 
 
 class LayerTruth(SurfaceTruth, Protocol):

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from rtgs.evaluate.evaluate import EvaluationTable
+from rtgs.evaluate.records import EvaluationTable
 from rtgs.evaluate.tables import PAPER_SCORES, PaperScore
 
 STAND_IN, PAPER_DATA, OWN_DATA = "stand_in", "paper", "own"

@@ -4,15 +4,15 @@ captures, and of the object's mesh, against its masks and its true container."""
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Protocol
 
 import torch
 from torch import Tensor
 
+from rtgs.evaluate.records import SURFACE_METRICS
+
 DEPTH_TOLERANCE = 0.03  # of the true depth
 NORMAL_TOLERANCE = 15.0  # degrees
-SURFACE_METRICS = ("depth_error_masked", "depth_share_masked", "normal_degrees_masked", "normal_share_masked")
 
 
 class SurfaceTruth(Protocol):
@@ -31,40 +31,6 @@ class MeshSurfaces(Protocol):
     def hit(self) -> Tensor: ...  # (H, W) bool
     @property
     def second(self) -> Tensor: ...  # (H, W) bool
-
-
-@dataclass(frozen=True)
-class ObjectFacts:
-    """The mesh of the transparent object; None: not known. Shares are of the pixels in the masks that bound something.
-
-    The fallbacks of methods.md 6.3: where the mesh has one surface, the object is a thin sheet, seen through without a
-    depth between its walls; where the ray misses it, a training pixel likewise, and a test pixel shows no transmission.
-    """
-
-    source: str  # "hull", "tsdf", "given"
-    flat: bool  # a pane: one surface everywhere
-    silhouette_iou: float | None  # with the masks of the training views, where nothing opaque hides the object
-    distance: float | None  # of mesh and true container to each other, mean, in diagonals of the container
-    front: float | None  # share of first surfaces within 3 % of the true one, over the test views
-    back: float | None  # of second ones
-    one_hit: float | None  # share whose ray meets one surface only, over the training views
-    no_hit: float | None  # share whose ray misses the mesh, likewise
-    no_hit_test: float | None  # over the test views
-
-    def numbers(self) -> dict[str, float]:
-        """What is known, by name."""
-        return {name: value for name, value in vars(self).items() if isinstance(value, float)}
-
-    @property
-    def fallbacks(self) -> str:
-        """One line on rays without a pair of surfaces."""
-        if self.one_hit is None or self.no_hit is None:
-            return "no masks"
-        text = f"of the masked training pixels {self.one_hit:.2%} meet one surface only, {self.no_hit:.2%} miss the "
-        text += "mesh: a thin sheet there"
-        if self.no_hit_test is not None:
-            text += f"; of the test views' masks {self.no_hit_test:.2%} miss it: nothing is transmitted there"
-        return f"{text}; a pane has one surface by nature" if self.flat else text
 
 
 def surface_errors(depth: Tensor, normal: Tensor | None, truth: SurfaceTruth, mask: Tensor) -> tuple[Tensor, Tensor]:

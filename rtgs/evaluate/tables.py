@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from rtgs.evaluate.evaluate import EvaluationTable
+from rtgs.evaluate.records import EvaluationTable
 
 NOT_AVAILABLE = "n/a"
 

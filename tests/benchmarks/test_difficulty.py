@@ -5,7 +5,7 @@ import json
 import pytest
 
 from benchmarks import difficulty
-from rtgs.evaluate.evaluate import EvaluationTable, RunFacts, ViewScore
+from rtgs.evaluate.records import EvaluationTable, RunFacts, ViewScore
 from rtgs.scenes.embedded import embedded_capture
 from rtgs.scenes.synthetic.record import CAPTURE_RECORD, CaptureRecord
 

@@ -15,8 +15,9 @@ from benchmarks import picture
 from pipelines.evaluate import TABLE_JSON
 from pipelines.results import RUN_FILE
 from rtgs.errors import RtgsError
-from rtgs.evaluate.evaluate import EvaluationSettings, RunFacts, TimedRender, evaluate_views, write_json
+from rtgs.evaluate.evaluate import EvaluationSettings, TimedRender, evaluate_views
 from rtgs.evaluate.images import file_stem
+from rtgs.evaluate.records import RunFacts, write_json
 from rtgs.scenes.canonical import save_scene
 from rtgs.scenes.scene import load_scene
 from rtgs.scenes.settings import SceneSettings

@@ -12,20 +12,10 @@ import torch
 from PIL import Image
 
 from rtgs.evaluate import weights as pretrained
-from rtgs.evaluate.evaluate import (
-    METRICS,
-    NO_TEST_VIEWS,
-    EvaluationSettings,
-    RunFacts,
-    TimedRender,
-    evaluate_views,
-    read_json,
-    write_csv,
-    write_error_maps,
-    write_json,
-)
+from rtgs.evaluate.evaluate import NO_TEST_VIEWS, EvaluationSettings, TimedRender, evaluate_views, write_error_maps
 from rtgs.evaluate.images import colorize, error_map
 from rtgs.evaluate.metrics import psnr, ssim
+from rtgs.evaluate.records import METRICS, RunFacts, read_json, write_csv, write_json
 from rtgs.evaluate.tables import PAPER_SCORES, summarize
 
 FACTS = RunFacts("desk", "2dgs", "smoke", steps=300, surfels=1234, train_seconds=12.5, peak_memory_mb=800.0)

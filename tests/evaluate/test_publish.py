@@ -5,8 +5,8 @@ import io
 
 import pytest
 
-from rtgs.evaluate.evaluate import METRICS, EvaluationTable, RunFacts, ViewScore
 from rtgs.evaluate.publish import Measured, TableSpec, build_table
+from rtgs.evaluate.records import METRICS, EvaluationTable, RunFacts, ViewScore
 from rtgs.evaluate.table_formats import comma_separated, latex, markdown, page, write_table
 
 

@@ -361,15 +361,34 @@ def test_the_module_is_the_same_as_the_command(first, words):
     assert "nothing to do" in result.stderr
 
 
-def test_planning_loads_nothing_that_takes_seconds(root):
-    """A table that is all there is shown again in seconds: no torch, no tracker, no cluster."""
+def slow_modules(words: list[str]) -> str:
+    """Which of the modules that take long to import a command loads."""
     code = (
         "import sys; from pipelines.cli import main; assert main(sys.argv[1:]) == 0; "
         "print('loaded', sorted({'torch', 'mlflow', 'distributed', 'cv2', 'skimage', 'scipy'} & set(sys.modules)))"
     )
-    words = ["plan", "--multirun", "experiment=table3", "preset=smoke"]
     done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines()[-1] == "loaded []"
+    return done.stdout.splitlines()[-1]
+
+
+def test_planning_loads_nothing_that_takes_seconds():
+    assert slow_modules(["plan", "--multirun", "experiment=table3", "preset=smoke"]) == "loaded []"
+
+
+@pytest.mark.parametrize("sweep", [[], ["--multirun", "table.name=shown"]])
+def test_a_run_that_is_all_there_is_shown_again_in_seconds(first, words, sweep):
+    assert main([*words, *sweep]) == 0
+    assert slow_modules([*words, *sweep]) == "loaded []"
+
+
+def test_an_instruction_set_that_is_misspelled_stops_a_run_before_any_step(first, words, root):
+    before = sorted((root / "store").rglob("manifest.json"))
+    code = [sys.executable, "-m", "pipelines.run", *words[1:], "seed=9", "name=misspelled"]
+    done = subprocess.run(code, env=os.environ | {"RTGS_ISA": "sse9"}, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert "RTGS_ISA='sse9' is not an instruction set" in done.stderr
+    assert before
+    assert sorted((root / "store").rglob("manifest.json")) == before
 
 
 def test_a_killed_training_goes_on_and_ends_the_same(words, first, root, tmp_path, monkeypatch, capsys):

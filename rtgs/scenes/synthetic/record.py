@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from rtgs.scenes.settings import CaptureError
 from rtgs.scenes.synthetic.layers import LightLayers
-from rtgs.scenes.synthetic.noise import picture_psnr
 
 CAPTURE_RECORD = "synthetic.json"
 VIEW_RECORD = "record.json"
@@ -108,6 +107,8 @@ def reflected_share(layers: LightLayers, where: NDArray[np.bool_]) -> float | No
 
 def noise_psnrs(views: list[ViewRecord]) -> list[float]:
     """PSNR of every test view against its converged render, dB."""
+    from rtgs.scenes.synthetic.noise import picture_psnr  # loads torch, which plans that read a record do without
+
     return [picture_psnr(view.noise) for view in views if view.noise is not None]
 
 

@@ -1,0 +1,194 @@
+"""What an evaluation found, and its files. Without torch: cached results are shown without what computes them."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+FORMAT = "rtgs-evaluation"
+VERSION = 4  # 2: the layer metrics; 3: transmission, given masks; 4: the surface in the mask, the object's mesh
+LAYER_METRICS = (
+    "psnr_specular",
+    "psnr_diffuse_part",
+    *(f"psnr_{layer}{scaled}" for layer in ("reflection", "transmission") for scaled in ("", "_scaled")),
+)
+SURFACE_METRICS = ("depth_error_masked", "depth_share_masked", "normal_degrees_masked", "normal_share_masked")
+# Seen through the test views' own masks instead of the mesh's silhouette (methods.md 7; register row 21).
+GIVEN_MASK_METRICS = ("psnr_given_masks", "psnr_masked_given_masks", "ssim_masked_given_masks")
+# In the order of the columns. Higher is better for psnr*, ssim*, *_share*; lower for lpips*, *_error*, *_degrees*.
+METRICS = (
+    "psnr",
+    "ssim",
+    "lpips_01",
+    "lpips_11",
+    "psnr_masked",
+    "ssim_masked",
+    "lpips_01_masked",
+    "lpips_11_masked",
+    *LAYER_METRICS,
+    *GIVEN_MASK_METRICS,
+    *SURFACE_METRICS,
+    "psnr_8bit",
+    "ssim_8bit",
+    "lpips_01_8bit",
+    "render_seconds",
+)
+
+
+@dataclass(frozen=True)
+class ObjectFacts:
+    """The mesh of the transparent object; None: not known. Shares are of the pixels in the masks that bound something.
+
+    The fallbacks of methods.md 6.3: where the mesh has one surface, the object is a thin sheet, seen through without a
+    depth between its walls; where the ray misses it, a training pixel likewise, and a test pixel shows no transmission.
+    """
+
+    source: str  # "hull", "tsdf", "given"
+    flat: bool  # a pane: one surface everywhere
+    silhouette_iou: float | None  # with the masks of the training views, where nothing opaque hides the object
+    distance: float | None  # of mesh and true container to each other, mean, in diagonals of the container
+    front: float | None  # share of first surfaces within 3 % of the true one, over the test views
+    back: float | None  # of second ones
+    one_hit: float | None  # share whose ray meets one surface only, over the training views
+    no_hit: float | None  # share whose ray misses the mesh, likewise
+    no_hit_test: float | None  # over the test views
+
+    def numbers(self) -> dict[str, float]:
+        """What is known, by name."""
+        return {name: value for name, value in vars(self).items() if isinstance(value, float)}
+
+    @property
+    def fallbacks(self) -> str:
+        """One line on rays without a pair of surfaces."""
+        if self.one_hit is None or self.no_hit is None:
+            return "no masks"
+        text = f"of the masked training pixels {self.one_hit:.2%} meet one surface only, {self.no_hit:.2%} miss the "
+        text += "mesh: a thin sheet there"
+        if self.no_hit_test is not None:
+            text += f"; of the test views' masks {self.no_hit_test:.2%} miss it: nothing is transmitted there"
+        return f"{text}; a pane has one surface by nature" if self.flat else text
+
+
+@dataclass(frozen=True)
+class RunFacts:
+    """What was measured, printed in every row of the CSV and at the head of the JSON."""
+
+    scene: str
+    method: str
+    preset: str = ""
+    steps: int | None = None
+    surfels: int | None = None
+    train_seconds: float | None = None  # by the wall
+    train_cpu_seconds: float | None = None  # all threads
+    peak_memory_mb: float | None = None
+
+
+@dataclass(frozen=True)
+class ViewScore:
+    """One row. A metric that is None has its reason in :attr:`EvaluationTable.missing`."""
+
+    view: str
+    width: int
+    height: int
+    mask_share: float | None  # share of the pixels inside the mask; None without a mask
+    values: dict[str, float | None]  # keys: METRICS
+
+
+@dataclass(frozen=True)
+class EvaluationTable:
+    """The measured result of one method on one scene."""
+
+    facts: RunFacts
+    rows: tuple[ViewScore, ...]
+    missing: dict[str, str] = field(default_factory=dict)  # metric -> why it is absent (in all views, or in some)
+    reflection_scale: float | None = None  # of psnr_reflection_scaled
+    transmission_scale: float | None = None  # of psnr_transmission_scaled
+    object: ObjectFacts | None = None  # of methods with a third stage, on scenes that have one
+
+    def mean(self, metric: str) -> float | None:
+        """Mean over the views that have the metric; None when none has."""
+        values = self._present(metric)
+        return sum(values) / len(values) if values else None
+
+    def std(self, metric: str) -> float | None:
+        """Population standard deviation over the views that have the metric."""
+        values = self._present(metric)
+        if not values:
+            return None
+        mean = sum(values) / len(values)
+        return math.sqrt(sum((value - mean) ** 2 for value in values) / len(values))
+
+    def count(self, metric: str) -> int:
+        """Views that have the metric."""
+        return len(self._present(metric))
+
+    @property
+    def resolution(self) -> str:
+        """``WxH``, or the range when the views differ; empty without views."""
+        sizes = sorted({(row.width, row.height) for row in self.rows})
+        return " to ".join(f"{width}x{height}" for width, height in dict.fromkeys(sizes[:1] + sizes[-1:]))
+
+    def _present(self, metric: str) -> list[float]:
+        if metric not in METRICS:
+            raise KeyError(f"no metric {metric!r}; there are {', '.join(METRICS)}")
+        return [value for row in self.rows if (value := row.values[metric]) is not None]
+
+
+def write_json(path: Path, table: EvaluationTable) -> None:
+    """The whole table; absent figures are null and explained under ``missing``."""
+    document = {
+        "format": FORMAT,
+        "version": VERSION,
+        "facts": asdict(table.facts),
+        "resolution": table.resolution,
+        "mean": {name: table.mean(name) for name in METRICS},
+        "std": {name: table.std(name) for name in METRICS},
+        "count": {name: table.count(name) for name in METRICS},
+        "missing": table.missing,
+        "reflection_scale": table.reflection_scale,
+        "transmission_scale": table.transmission_scale,
+        "object": None if table.object is None else asdict(table.object),
+        "views": [asdict(row) for row in table.rows],
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(document, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def read_json(path: Path) -> EvaluationTable:
+    """Read what :func:`write_json` wrote.
+
+    Raises:
+        ValueError: another file, or one of another version.
+    """
+    document = json.loads(path.read_text(encoding="utf-8"))
+    found = (document.get("format"), document.get("version")) if isinstance(document, dict) else (None, None)
+    if found != (FORMAT, VERSION):
+        raise ValueError(f"{path} is not an evaluation: format {found}, expected {(FORMAT, VERSION)}")
+    return EvaluationTable(
+        RunFacts(**document["facts"]),
+        tuple(ViewScore(**row) for row in document["views"]),
+        document["missing"],
+        document["reflection_scale"],
+        document["transmission_scale"],
+        None if document["object"] is None else ObjectFacts(**document["object"]),
+    )
+
+
+def write_csv(path: Path, table: EvaluationTable) -> None:
+    """One line per view, then mean and std; an absent figure is an empty field."""
+    facts = asdict(table.facts)
+    header = ["scene", "method", "preset", "view", "resolution", "mask_share", *METRICS]
+    header += ["steps", "surfels", "train_seconds", "train_cpu_seconds", "peak_memory_mb"]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.DictWriter(stream, header, restval="")
+        writer.writeheader()
+        for row in table.rows:
+            cells = {"view": row.view, "resolution": f"{row.width}x{row.height}", "mask_share": row.mask_share}
+            writer.writerow({**facts, **row.values, **cells})
+        for label, statistic in (("mean", table.mean), ("std", table.std)):
+            cells = {name: statistic(name) for name in METRICS}
+            writer.writerow({**facts, **cells, "view": label, "resolution": table.resolution})
