@@ -60,6 +60,10 @@ def _recorded(root: Path) -> int:
     return len(list((root / "tracking").rglob("events.jsonl")))
 
 
+def _folder_of_a_report(store: Store) -> Path:
+    return next(iter(store.artifacts("report"))).folder
+
+
 def test_a_sweep_is_one_plan_and_every_job_has_its_results(capture, tmp_path, capsys):
     words = [
         "run",
@@ -111,11 +115,13 @@ def test_a_sweep_is_one_plan_and_every_job_has_its_results(capture, tmp_path, ca
     assert "17 steps, 17 from the cache, nothing to do" in capsys.readouterr().err
     assert _recorded(tmp_path) == len(starts)  # no job is recorded twice, and no sweep that has nothing new
 
-    shutil.rmtree(next(iter(store.artifacts("report"))).folder)
-    assert main(words) == 0
-    assert "17 steps, 16 from the cache" in capsys.readouterr().err
-    (other,) = {*(tmp_path / "tracking" / "rtgs-runs").glob("sweep_*")} - {group}
-    assert (other / "artifacts" / "table.md").read_text() == table  # a sweep with something new has its table
+    for hits, lost in ((17, tmp_path / "tables" / "mine-smoke" / ".tracked.json"), (16, _folder_of_a_report(store))):
+        groups = set((tmp_path / "tracking" / "rtgs-runs").glob("sweep_*"))
+        shutil.rmtree(lost) if lost.is_dir() else lost.unlink()
+        assert main([*words, f"hydra.sweep.dir={tmp_path / f'again{hits}'}"]) == 0
+        assert f"17 steps, {hits} from the cache" in capsys.readouterr().err
+        (other,) = {*(tmp_path / "tracking" / "rtgs-runs").glob("sweep_*")} - groups
+        assert (other / "artifacts" / "table.md").read_text() == table  # it was not known to be recorded; it has news
 
     assert main(["plan", *jobs, "method.loss.l1=0.8,0.7"]) == 0
     lines = capsys.readouterr().out.splitlines()
