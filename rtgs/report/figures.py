@@ -19,6 +19,8 @@ from rtgs.mesh.triangles import TriangleMesh
 
 DEPTH_COLORMAP = "turbo"
 MASK_COLOR = (60, 220, 230)  # cyan: no colour of the error map
+_ROUNDS = ("-", "--", ":")  # lines of curves that share a colour
+_LEGEND_WIDTH, _LEGEND_HANDLE = 72, 5  # characters of a legend's row; a line and its gaps take as much as so many
 COVERED = 0.5  # alpha from which a pixel counts when the depth range is chosen
 DEPTH_QUANTILES = (0.02, 0.98)
 # Colours of the curves: blue, orange, green, red-violet, grey; told apart on light and dark grounds.
@@ -159,7 +161,8 @@ def curve_svg(curves: Sequence[Curve], *, label: str, log: bool = False) -> str:
             values = [value if _shown(value, log) else math.nan for value in curve.values]
             marker = "o" if len(values) < 12 else ""
             color = SERIES_COLORS[index % len(SERIES_COLORS)]
-            axes.plot(curve.steps, values, color=color, lw=1.5, marker=marker, ms=3.5, label=curve.name)
+            style = _ROUNDS[index // len(SERIES_COLORS) % len(_ROUNDS)]
+            axes.plot(curve.steps, values, style, color=color, lw=1.5, marker=marker, ms=3.5, label=curve.name)
         _style(axes, label, log)
         if len(drawable) > 1:
             axes.legend(
@@ -168,7 +171,7 @@ def curve_svg(curves: Sequence[Curve], *, label: str, log: bool = False) -> str:
                 fontsize=7.5,
                 handlelength=1.0,
                 handletextpad=0.5,
-                ncols=len(drawable),
+                ncols=_legend_columns([curve.name for curve in drawable]),
                 columnspacing=0.9,
                 loc="lower right",
                 bbox_to_anchor=(1, 0.98),
@@ -180,6 +183,12 @@ def curve_svg(curves: Sequence[Curve], *, label: str, log: bool = False) -> str:
     svg = buffer.getvalue()
     svg = svg[svg.index("<svg") :]
     return svg.replace(_INK, "var(--ink-soft)").replace(_GRID, "var(--line)")
+
+
+def _legend_columns(names: Sequence[str]) -> int:
+    """As many as fit into one row of a legend, so that the axes keep their room however many curves there are."""
+    widest = max(map(len, names)) + _LEGEND_HANDLE
+    return max(1, min(len(names), _LEGEND_WIDTH // widest))
 
 
 def _shown(value: float, log: bool) -> bool:

@@ -4,6 +4,7 @@ import base64
 import io
 import math
 import re
+import warnings
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -263,6 +264,17 @@ def test_pictures_are_shrunk_never_enlarged() -> None:
     for long_side, size in ((20, (20, 10)), (100, (60, 30))):
         with Image.open(io.BytesIO(image_bytes(pixels, long_side, 90))) as picture:
             assert picture.size == size
+
+
+def test_many_curves_leave_their_panel_room_and_are_told_apart():
+    names = ("l1", "dssim", "normal", "mono_normal", "distortion", "specular", "transmission_depth", "interface_normal")
+    curves = [Curve(name, (0, 1), (1.0, 0.5 + 0.1 * index)) for index, name in enumerate(names)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # of a legend that takes all the room
+        svg = curve_svg(curves, label="Loss terms", log=True)
+    assert [svg.count(f">{name}<") for name in names] == [1] * len(names)
+    drawn = re.findall(r"style=\"fill: none; (stroke[^\"]*stroke-width: 1.5[^\"]*)\"", svg)
+    assert len({style for style in drawn}) == len(names)
 
 
 def test_curves_skip_what_cannot_be_drawn() -> None:
