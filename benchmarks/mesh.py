@@ -52,8 +52,8 @@ def measure(name: str, scene: Scene) -> list[str]:
     seconds = time.process_time() - start
     rows = []
 
-    def row(kind: str, mesh: TriangleMesh, voxel: float, seconds: float) -> None:
-        hits = hit_score(ObjectMesh(mesh, "given", voxel, False), truth, [view.camera for view in scene.test])
+    def row(source: str, kind: str, mesh: TriangleMesh, voxel: float, seconds: float) -> None:
+        hits = hit_score(ObjectMesh(mesh, source, voxel, False), truth, [view.camera for view in scene.test])
         distance = mesh_distance(mesh, truth)
         iou = silhouette_score(mesh, masks.views, hull.hidden).mean
         plain = silhouette_score(mesh, masks.views).mean
@@ -62,7 +62,7 @@ def measure(name: str, scene: Scene) -> list[str]:
             f"{hits.front:.3f} | {hits.back:.3f} | {hits.normal_mean:.1f} / {hits.normal_median:.1f} | {seconds:.1f} |"
         )
 
-    row(f"hull, k = {hull.outvoted}", hull.mesh, hull.voxel, seconds)
+    row("hull", f"hull, k = {hull.outvoted}", hull.mesh, hull.voxel, seconds)
     guide = MeshGuide(truth, 0.0)
     box = np.stack([truth.vertices.min(0), truth.vertices.max(0)]).astype(np.float64)
     box += np.array([[-0.05], [0.05]]) * (box[1] - box[0]).max()
@@ -72,7 +72,7 @@ def measure(name: str, scene: Scene) -> list[str]:
     ]
     start = time.process_time()
     fused = fuse_depths(views, cameras, settings)
-    row("TSDF of the true depth", fused.mesh, fused.voxel, time.process_time() - start)
+    row("tsdf", "TSDF of the true depth", fused.mesh, fused.voxel, time.process_time() - start)
     return rows
 
 

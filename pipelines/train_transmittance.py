@@ -65,7 +65,7 @@ def _numbers(scores: BoundaryScores, when: str) -> dict[str, float]:
 
 STEP = StepKind(
     "train_transmittance",
-    4,
+    5,
     train_transmittance,
     helpers=(
         *train_reflection.STEP.helpers,

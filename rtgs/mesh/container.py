@@ -16,7 +16,7 @@ from torch import Tensor
 from rtgs.cameras import Camera
 from rtgs.errors import RtgsError
 from rtgs.mesh.guide import MeshGuide
-from rtgs.mesh.normals import corner_normals, interpolated
+from rtgs.mesh.normals import corner_normals, interpolated, neighbourhood_normals
 from rtgs.mesh.triangles import TriangleMesh, read_mesh_ply, write_mesh_ply
 
 MESH_FILE = "mesh.ply"
@@ -25,7 +25,7 @@ SOURCES = ("hull", "tsdf", "given")
 MERGE_VOXELS = 2.0  # crossings nearer than this are one wall (methods.md 6.3)
 BOX_MARGIN = 0.05  # of the object box, on each side (methods.md 6.2)
 _BOX_POINTS = 0.005  # share of the points behind a pane that its box leaves out at either end of each axis
-_NORMAL_ROUNDS = 2  # of smoothing; measured in docs/mesh.md
+_NORMAL_ROUNDS, _NORMAL_REACH = 2, 5.0  # of smoothing; voxels; measured in docs/mesh.md
 _BATCH = 65536  # points whose rays are cast at once
 
 
@@ -53,8 +53,11 @@ class ObjectMesh:
 
     @cached_property
     def corners(self) -> np.ndarray:
-        """(F, 3, 3) float32 smoothed unit normals of the faces' corners."""
-        return corner_normals(self.mesh, _NORMAL_ROUNDS)
+        """(F, 3, 3) float32 smoothed unit normals of the faces' corners; of a given mesh only a little."""
+        corners = corner_normals(self.mesh, _NORMAL_ROUNDS)
+        if self.source == "given" or self.flat:
+            return corners
+        return neighbourhood_normals(self.mesh, corners, _NORMAL_REACH * self.voxel)
 
     @cached_property
     def rays(self) -> MeshGuide:

@@ -184,8 +184,7 @@ class GlassStage(ReflectiveMethod):
             means_lr_steps=self.schedule.means_lr_steps,
             extent=self.extent,
         )
-        made.floor = self.settings.transmittance.interface.floor
-        return made
+        return made.put(self.settings.transmittance.interface.floor)
 
     def glass_mask(self, view: View) -> Tensor | None:
         """L_spec acts in masks that bound something, unless the stage was left out."""

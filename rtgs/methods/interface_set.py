@@ -12,16 +12,48 @@ from rtgs.gaussians.density import logit
 from rtgs.gaussians.harmonics import rest_count
 from rtgs.gaussians.initialize import neighbor_distance
 from rtgs.gaussians.materials import MaterialSurfels, with_materials
+from rtgs.gaussians.primitives import tangents
 from rtgs.gaussians.surfels import Surfels
 from rtgs.mesh.container import ObjectMesh
 from rtgs.methods.surfel_set import SurfelSet
 from rtgs.train.settings import MethodSettings
 
+_NORMALS = "normals"  # in the state
+
 
 class InterfaceSet(SurfelSet):
-    """A set without density control whose opacities stay at or above ``floor``."""
+    """A set without density control whose opacities stay at or above ``floor``.
+
+    ``normals``: (N, 3) unit, those that the surfels were put on the mesh with.
+    """
 
     floor: float = 0.9
+    normals: Tensor
+
+    def put(self, floor: float) -> InterfaceSet:
+        """The set as it begins: what it is now is what it is held to."""
+        self.floor = floor
+        self.normals = self._normals().detach()
+        return self
+
+    def turned(self) -> Tensor:
+        """() mean of 1 - n . n(as put), of the surfels themselves: what lies around them is not bent with them."""
+        return (1 - (self._normals() * self.normals).sum(-1)).mean()
+
+    def _normals(self) -> Tensor:
+        return torch.linalg.cross(*tangents(self.surfels.quaternions))
+
+    def state(self) -> dict[str, Tensor]:
+        return super().state() | {f"{self.name}.{_NORMALS}": self.normals}
+
+    def load(self, state: dict[str, Tensor]) -> None:
+        super().load(state)
+        key = f"{self.name}.{_NORMALS}"
+        if key not in state:
+            raise ValueError(
+                f"the checkpoint has no {key}: it was written by another version; train again from the start"
+            )
+        self.normals = state[key].clone()
 
     @torch.no_grad()
     def _clamp(self) -> None:

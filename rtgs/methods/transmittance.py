@@ -184,8 +184,11 @@ class TransmissiveMethod(GlassStage):
             pixels = rendered.camera.height * rendered.camera.width
             value = depth_loss(rendered.first_bounce, loss.transmission_depth_form, pixels)
             found = found.plus("transmission_depth", value, loss.transmission_depth)
-        wanted = interface.normal_loss > 0 and step < loss_start(interface.normal_loss_until, self.schedule.total)
-        if wanted and self.interface is not None and rendered.transparent is not None:
+        if self.interface is None or step >= loss_start(interface.normal_loss_until, self.schedule.total):
+            return found
+        if interface.normal_hold > 0:
+            found = found.plus("interface_hold", self.interface.turned(), interface.normal_hold)
+        if interface.normal_loss > 0 and rendered.transparent is not None:
             found = found.plus("interface_normal", self._interface_normal(rendered), interface.normal_loss)
         return found
 

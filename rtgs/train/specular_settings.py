@@ -5,7 +5,7 @@ Boundaries are shares of the run (``schedule.total``), intervals are steps: see 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from rtgs.train.refuse import refuse_bad_numbers, refuse_unless
 
@@ -119,8 +119,10 @@ class InterfaceSettings:
     # near 0.25 and ends as well (docs/transmittance.md).
     f0: float = 0.15  # initial
     roughness: float = 0.005  # initial
-    normal_loss: float = 0.2  # weight of 1 - n . N of the mesh in the masks: 0.01 does nothing there, 0.05 harms
-    normal_loss_until: float = 1.0  # share of the run; afterwards only reflections move the normals
+    normal_loss: float = 0.2  # weight of 1 - n . N of the mesh in the masks; n as rasterised, so the base set bends too
+    # weight of the mean over the interface's surfels of 1 - n . n as put on the mesh: 0 = none (docs/transmittance.md)
+    normal_hold: float = field(default=0.0, metadata={"recipe": "unless default"})
+    normal_loss_until: float = 1.0  # share of the run for both; afterwards only reflections move the normals
     masked_share: float = 0.5  # of the views in which a point of the mesh is the first surface: masked there in fewer
     # than this share, it is no glass (a label, the lid that a hull puts on a cup) and gets no surfels
 
@@ -134,3 +136,6 @@ class InterfaceSettings:
             self.opacity >= self.floor, "method.transmittance.interface.opacity", self.opacity, f"at least {self.floor}"
         )
         refuse_unless(self.scale > 0, "method.transmittance.interface.scale", self.scale, "above 0")
+        for name in ("normal_loss", "normal_hold"):
+            value = getattr(self, name)
+            refuse_unless(value >= 0, f"method.transmittance.interface.{name}", value, "at least 0 (0: none)")

@@ -63,7 +63,7 @@ def test_rungs_share_the_stages_that_do_not_differ(tmp_path: Path):
     config = base_config("ball_statue", arguments)  # type: ignore[arg-type]
     assert (config.schedule.total, config.scene.long_side) == (1000, 128)
     keys: dict[str, dict[str, str]] = {}
-    for name in ("truth", "hull", "tsdf", "paper", "before", "normal_loss_1", "paper_mono_in_mask", "two_stages"):
+    for name in ("truth", "hull", "tsdf", "paper", "before", "normal_hold_1", "paper_mono_in_mask", "two_stages"):
         words = ["scene=ball_statue", "method=rtgs", "preset=quick", *sized(arguments)]  # type: ignore[arg-type]
         words += [f"scene.split_file={setting.split}", *RUNGS[name].words(setting, config)]
         keys[name] = {step.name: step.fingerprint for step in build_graph(*compose(words)).training}

@@ -240,6 +240,63 @@ def test_the_losses_of_glass_start_at_their_steps(made: GlassScene):
     assert "interface_normal" in names(35)
 
 
+def held(weight: float, rate: float = 0.0) -> MethodSettings:
+    """Normals held by ``weight``, and nothing else that holds them."""
+    return glass_recipe(interface=InterfaceSettings(count=150, normal_loss=rate, normal_hold=weight))
+
+
+def test_the_interface_is_held_to_the_normals_it_was_put_with(made: GlassScene):
+    """Closed form: a surfel turned by an angle about one of its own axes costs 1 - cos of it, and is pulled back."""
+    method = begun(held(3.0), made)
+    interface = method.interface
+    assert interface is not None
+    centre = torch.tensor([0.0, 0.0, -0.2])
+    outwards = torch.nn.functional.normalize(interface.surfels.means.detach() - centre, dim=1)
+    assert float((interface.normals * outwards).sum(1).min()) > 0.95
+    assert float(interface.turned().detach()) == pytest.approx(0, abs=1e-6)
+    half, rows = torch.tensor(0.2), 15
+    with torch.no_grad():  # q times a turn by 0.4 about the first tangent
+        w, x, y, z = interface.surfels.quaternions[:rows].clone().unbind(1)
+        c, s = half.cos(), half.sin()
+        interface.surfels.quaternions[:rows] = torch.stack(
+            (w * c - x * s, x * c + w * s, y * c + z * s, z * c - y * s), 1
+        )
+    turned = interface.turned()
+    assert float(turned.detach()) == pytest.approx(float(1 - (2 * half).cos()) * rows / 150, rel=1e-4)
+    turned.backward()
+    gradient = interface.surfels.quaternions.grad
+    assert gradient is not None
+    assert bool((gradient[:rows].norm(dim=1) > 1e-4).all())
+    assert float(gradient[rows:].abs().max()) < 1e-6
+    with torch.no_grad():
+        interface.surfels.quaternions -= gradient
+        assert float(interface.turned()) < float(turned.detach())
+
+
+def test_what_holds_the_normals_is_counted_where_it_has_a_weight(made: GlassScene):
+    view = made.scene.train[0]
+    found = {}
+    for name, recipe in {"hold": held(3.0), "raster": held(0.0, 0.2), "none": held(0.0)}.items():
+        method = begun(recipe, made)
+        terms = method.losses(method.render(view.camera, 35, None, view.mask), view, 35).terms
+        found[name] = {term.name: term.weight for term in terms if term.name.startswith("interface")}
+    assert found == {"hold": {"interface_hold": 3.0}, "raster": {"interface_normal": 0.2}, "none": {}}
+    ended = replace(held(3.0, 0.2).transmittance.interface, normal_loss_until=0.5)
+    method = begun(glass_recipe(interface=ended), made)
+    terms = method.losses(method.render(view.camera, 35, None, view.mask), view, 35).terms
+    assert not [term for term in terms if term.name.startswith("interface")]
+
+
+def test_held_normals_stay_nearer_to_the_mesh(made: GlassScene):
+    turned = []
+    for weight in (0.0, 20.0):
+        method = new_glass_method(held(weight), made)
+        train_stages(method, made.scene)
+        assert method.interface is not None
+        turned.append(float(method.interface.turned()))
+    assert turned[1] < 0.5 * turned[0]
+
+
 def test_a_mesh_with_a_hole_trains(made: GlassScene):
     """Rays through it meet the far wall first: one surface, a thin sheet there."""
     whole = made.mesh.mesh
@@ -262,7 +319,7 @@ def _events_of(method, step: int):
 
 
 def test_a_killed_stage_goes_on_bit_for_bit(made: GlassScene, tmp_path: Path):
-    settings = glass_recipe()
+    settings = held(5.0)
     whole = new_glass_method(settings, made)
     train_stages(whole, made.scene, folder=tmp_path / "whole")
     halves = new_glass_method(settings, made)
@@ -280,6 +337,9 @@ def test_a_killed_stage_goes_on_bit_for_bit(made: GlassScene, tmp_path: Path):
     assert "third_stage" in first
     for name, tensor in first.items():
         assert torch.equal(tensor, second[name]), name
+    del second["interface.normals"]
+    with pytest.raises(ValueError, match=r"no interface.normals: .* train again"):
+        resumed.load(second)
 
 
 @pytest.mark.parametrize(
