@@ -136,6 +136,3 @@ class InterfaceSettings:
             self.opacity >= self.floor, "method.transmittance.interface.opacity", self.opacity, f"at least {self.floor}"
         )
         refuse_unless(self.scale > 0, "method.transmittance.interface.scale", self.scale, "above 0")
-        for name in ("normal_loss", "normal_hold"):
-            value = getattr(self, name)
-            refuse_unless(value >= 0, f"method.transmittance.interface.{name}", value, "at least 0 (0: none)")

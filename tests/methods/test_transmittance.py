@@ -271,6 +271,10 @@ def test_the_interface_is_held_to_the_normals_it_was_put_with(made: GlassScene):
     with torch.no_grad():
         interface.surfels.quaternions -= gradient
         assert float(interface.turned()) < float(turned.detach())
+        interface.surfels.quaternions[0] = 0  # the identity, and no direction to go back in
+    interface.surfels.quaternions.grad = None
+    interface.turned().backward()
+    assert bool(torch.isfinite(interface.surfels.quaternions.grad).all())
 
 
 def test_what_holds_the_normals_is_counted_where_it_has_a_weight(made: GlassScene):

@@ -4,7 +4,10 @@ import math
 
 import pytest
 
+from rtgs.config import compose
+from rtgs.pipeline.fingerprint import canonical_json
 from rtgs.train.settings import LossSettings, OptimizerSettings
+from rtgs.train.specular_settings import InterfaceSettings
 
 
 @pytest.mark.parametrize("value", [-0.1, math.nan, math.inf])
@@ -23,3 +26,20 @@ def test_starts_are_shares_of_the_run(value):
 
 def test_zero_weights_are_legal():
     assert LossSettings(dssim=0.0, normal=0.0).dssim == 0.0
+
+
+@pytest.mark.parametrize("name", ["normal_loss", "normal_hold"])
+def test_what_holds_the_normals_of_glass_is_never_negative(name):
+    assert getattr(InterfaceSettings(**{name: 0.0}), name) == 0
+    key = rf"method\.transmittance\.interface\.{name}"
+    with pytest.raises(ValueError, match=rf"{key}=-0\.1 must be a finite number of at least 0"):
+        InterfaceSettings(**{name: -0.1})
+
+
+@pytest.mark.parametrize("preset", ["smoke", "quick", "standard", "paper"])
+def test_glass_holds_its_own_normals_and_not_the_rasterised_ones(preset):
+    """docs/transmittance.md: 20 and 0, whatever the preset; a recipe without it is one from before it."""
+    own = compose(["scene=demo", "method=rtgs", f"preset={preset}"])[0].method.transmittance.interface
+    assert (own.normal_hold, own.normal_loss) == (20.0, 0.0)
+    free = compose(["scene=demo", "method=rtgs", f"preset={preset}", "method.transmittance.interface.normal_hold=0"])[0]
+    assert "normal_hold" not in canonical_json(free.method.transmittance.interface)
