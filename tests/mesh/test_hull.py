@@ -94,6 +94,8 @@ def test_depth_trims_the_unseen_bottom() -> None:
     assert trimmed.mesh.vertices[:, 2].min() > -0.05  # two voxels
     assert trimmed.trimmed is not None
     assert trimmed.trimmed > 0.005
+    found = [hit_score(ObjectMesh(item.mesh, "hull", item.voxel, False), body, cameras[:6]) for item in (bare, trimmed)]
+    assert found[1].back > 0.97 > found[0].back
     few = carve_hull(mask_set(cameras[:12], masks[:12], depths(table, cameras[:12])), COARSE)
     assert few.trimmed is None
     assert "too few" in few.note

@@ -277,6 +277,19 @@ def test_the_interface_is_held_to_the_normals_it_was_put_with(made: GlassScene):
     assert bool(torch.isfinite(interface.surfels.quaternions.grad).all())
 
 
+def test_the_floor_of_the_interface_is_the_settings_own(made: GlassScene):
+    """Also of a set that goes on from a checkpoint."""
+    recipe = glass_recipe(interface=InterfaceSettings(count=150, floor=0.6))
+    method = begun(recipe, made)
+    resumed = new_glass_method(recipe, made)
+    resumed.load({name: tensor.clone() for name, tensor in method.state().items()})
+    for interface in (method.interface, resumed.interface):
+        assert interface is not None
+        interface.surfels.opacity_logits.detach().fill_(-5.0)
+        interface.step(31, 0)
+        assert float(interface.surfels.opacity_logits.detach().sigmoid().max()) == pytest.approx(0.6)
+
+
 def test_what_holds_the_normals_is_counted_where_it_has_a_weight(made: GlassScene):
     view = made.scene.train[0]
     found = {}
@@ -285,10 +298,10 @@ def test_what_holds_the_normals_is_counted_where_it_has_a_weight(made: GlassScen
         terms = method.losses(method.render(view.camera, 35, None, view.mask), view, 35).terms
         found[name] = {term.name: term.weight for term in terms if term.name.startswith("interface")}
     assert found == {"hold": {"interface_hold": 3.0}, "raster": {"interface_normal": 0.2}, "none": {}}
-    ended = replace(held(3.0, 0.2).transmittance.interface, normal_loss_until=0.5)
-    method = begun(glass_recipe(interface=ended), made)
-    terms = method.losses(method.render(view.camera, 35, None, view.mask), view, 35).terms
-    assert not [term for term in terms if term.name.startswith("interface")]
+    method = begun(glass_recipe(interface=replace(held(3.0, 0.2).transmittance.interface, normal_loss_until=0.6)), made)
+    for step, names in ((35, ["interface_hold", "interface_normal"]), (36, [])):
+        terms = method.losses(method.render(view.camera, step, None, view.mask), view, step).terms
+        assert [term.name for term in terms if term.name.startswith("interface")] == names
 
 
 def test_held_normals_stay_nearer_to_the_mesh(made: GlassScene):
