@@ -17,13 +17,16 @@ from rtgs.cameras import Camera
 from rtgs.config.schema import MeshConfig, RunConfig
 from rtgs.errors import RtgsError
 from rtgs.mesh.container import read_object_mesh
+from rtgs.mesh.score import container_mesh
 from rtgs.mesh.settings import HullSettings, ObjectSettings, TsdfSettings
 from rtgs.mesh.triangles import TriangleMesh, read_mesh_ply, write_mesh_ply
 from rtgs.methods import RenderedView, RenderOptions
 from rtgs.pipeline import StepContext
 from rtgs.render.buffers import RasterBuffers
 from rtgs.scenes.canonical import save_scene
-from rtgs.scenes.scene import Scene, View
+from rtgs.scenes.embedded import embedded_capture
+from rtgs.scenes.scene import Scene, View, load_scene
+from rtgs.scenes.settings import SceneSettings
 from rtgs.track.null import NullTracker
 from tests.mesh.shapes import camera_at, sphere, sphere_depths
 
@@ -121,6 +124,32 @@ def test_mesh_of_the_transparent_object(context: StepContext, source: str) -> No
         assert np.abs(np.linalg.norm(mesh.mesh.vertices, axis=1) - 1).mean() < 0.06
     assert (context.out / "mesh.png").is_file()
     assert (context.out / "mesh.obj").is_file()
+
+
+def test_on_a_path_traced_scene_the_distance_to_the_true_container_is_tracked(
+    context: StepContext, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of the true container itself: none. It is in mesh.json, in the tracker and in what tables are made of."""
+    tracked: dict[str, float] = {}
+    monkeypatch.setattr(context.tracker, "metrics", lambda values, step=None: tracked.update(values))
+    path = str(embedded_capture("ball_statue"))
+    scene = load_scene(SceneSettings(name="ball_statue", path=path, long_side=48))
+    save_scene(scene, context.inputs["import_scene"])
+    true = container_mesh("ball_statue")
+    assert true is not None
+    write_mesh_ply(tmp_path / "true.ply", true)
+    settings = ObjectSettings(given=str(tmp_path / "true.ply"))
+    step.extract_mesh(replace(PARAMS, only_masked=True, source="given", object=settings), context)
+    truth = json.loads((context.out / "mesh.json").read_text())["truth"]
+    diagonal = float(np.linalg.norm(np.ptp(true.vertices, axis=0)))
+    assert max(truth[name] for name in ("distance", "distance_to_truth", "distance_from_truth")) < 1e-3 * diagonal
+    assert min(truth["front_within_3_percent"], truth["back_within_3_percent"]) == 1
+    assert truth["normal_degrees_median"] < 0.1
+    assert {f"mesh/{name}": value for name, value in truth.items()}.items() <= tracked.items()
+    known = evaluate.object_facts(context.out, scene)
+    assert known is not None
+    assert known.distance == pytest.approx(truth["distance"] / diagonal)
+    assert "distance" in known.numbers()
 
 
 def test_without_a_mask_that_shows_something_there_is_no_object_and_no_error(context: StepContext) -> None:
