@@ -161,3 +161,8 @@ def randomised(method: TransmissiveMethod, seed: int = 4) -> Tensor | None:
             part.surfels.opacity_logits += 1.0
         method.base.surfels.log_scales += 0.3
     return None
+
+
+def held(weight: float, rate: float = 0.0) -> MethodSettings:
+    """Normals held by ``weight``, and nothing else that holds them."""
+    return glass_recipe(interface=InterfaceSettings(count=150, normal_loss=rate, normal_hold=weight))
