@@ -276,7 +276,7 @@ def _sizes(mesh: TriangleMesh) -> dict[str, float]:
 
 STEP = StepKind(
     "extract_mesh",
-    2,
+    3,
     extract_mesh,
     helpers=(
         "pipelines.training",
