@@ -84,7 +84,7 @@ def _paper(*words: str) -> Callable[[Setting, RunConfig], list[str]]:
 
 _UNBOUNDED = (f"{_T}.rim=0", f"{_T}.max_weight=0")
 _ALL_GLASS = (f"{_I}.masked_share=0", f"{_T}.keep_seen=0")
-_RASTER = (f"{_I}.normal_hold=0",)
+_FREE = f"{_I}.normal_hold=0"
 LADDER: dict[str, Rung] = {
     "truth": Rung("true mesh, true normals held fixed", lambda s, _: [*_given(s), f"{_T}.normal=mesh"]),
     "truth_mesh": Rung("true mesh, normals learned", lambda s, _: _given(s)),
@@ -118,11 +118,11 @@ LADDER: dict[str, Rung] = {
         "hull, L_spec from the second stage on",
         lambda _, c: _hull(f"method.loss.specular_start={c.method.reflection.start}")(_, c),
     ),
-    "normals_free": Rung("hull, its normals not held", _hull(f"{_I}.normal_hold=0")),
+    "normals_free": Rung("hull, its normals not held", _hull(_FREE)),
     "normal_hold_1": Rung("hull, normal hold 1 (default 20)", _hull(f"{_I}.normal_hold=1")),
     "normal_hold_5": Rung("hull, normal hold 5", _hull(f"{_I}.normal_hold=5")),
-    "normal_loss_02": Rung("hull, loss 0.2 on the rasterised normal", _hull(*_RASTER, f"{_I}.normal_loss=0.2")),
-    "normal_loss_5": Rung("hull, loss 5 on the rasterised normal", _hull(*_RASTER, f"{_I}.normal_loss=5")),
+    "normal_loss_02": Rung("hull, loss 0.2 on the rasterised normal", _hull(_FREE, f"{_I}.normal_loss=0.2")),
+    "normal_loss_5": Rung("hull, loss 5 on the rasterised normal", _hull(_FREE, f"{_I}.normal_loss=5")),
 }
 CHOICES: dict[str, Rung] = {
     "before_all_glass": Rung("hull, no rim, w_r not bounded, all of it glass", _hull(*_UNBOUNDED, *_ALL_GLASS)),
