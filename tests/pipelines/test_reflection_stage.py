@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from pathlib import Path
 
@@ -60,3 +61,25 @@ def test_both_stages_run_and_leave_two_sets_and_layers(root: Path, capture: Path
     assert {path.name for path in run.glob("*.ply")} == {"point_cloud.ply", "reflection.ply"}
     assert main(words) == 0
     assert "nothing to do" in capsys.readouterr().err
+
+
+def test_the_split_sum_figure_shares_the_first_stage_and_shows_the_layers_of_both(root: Path, capture: Path):  # noqa: F811
+    words = ["run", "experiment=fig_split_sum", "hydra/launcher=basic", f"scene={capture}", *QUICK, *SECOND]
+    assert main(words) == 0
+    made = {
+        step: [path.parent for path in (root / "store" / step).glob("*/*/manifest.json")]
+        for step in ("train_diffuse", "train_reflection")
+    }
+    assert len(made["train_diffuse"]) == 1
+    assert {stage_params(folder).method.optics.weight for folder in made["train_reflection"]} == {
+        "microfacet",
+        "split_sum",
+    }
+    pictures = []
+    for run in ("tiny_room-rtgs-smoke", "tiny_room-rtgs-smoke-split_sum"):
+        page = (root / "runs" / run / "report.html").read_text(encoding="utf-8")
+        assert all(f"Enlarge {layer}, rendered" in page for layer in ("Diffuse", "Reflection", "Roughness"))
+        pictures.append(json.loads((root / "runs" / run / "metrics.json").read_text())["mean"]["psnr"])
+    assert pictures[0] != pictures[1]
+    with (root / "tables" / "fig_split_sum-smoke" / "table.csv").open(encoding="utf-8") as stream:
+        assert [row["method"] for row in csv.DictReader(stream)] == ["rtgs", "rtgs, split_sum"]
