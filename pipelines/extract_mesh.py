@@ -176,7 +176,9 @@ def _choice_record(choice: Choice) -> dict[str, object]:
     agreement = f"IoU with the masks {choice.iou.mean:.3f}"
     note = f"Of the transparent object: {kind}, voxel {choice.mesh.voxel:.4g}; {agreement}."
     hull = choice.hull
-    details = {} if hull is None else {"masks_outvoted": hull.outvoted, "trimmed": hull.trimmed}
+    details: dict[str, object] = {}
+    if hull is not None:
+        details = {"masks_outvoted": hull.outvoted, "trimmed": hull.trimmed, "trim_views": hull.trim_views}
     return {
         "note": note,
         "silhouette_iou": choice.iou.mean,
@@ -276,7 +278,7 @@ def _sizes(mesh: TriangleMesh) -> dict[str, float]:
 
 STEP = StepKind(
     "extract_mesh",
-    3,
+    4,
     extract_mesh,
     helpers=(
         "pipelines.training",

@@ -53,7 +53,8 @@ class _Candidates:
         self.hull = hull = carve_hull(self.masks, self.settings.hull)
         self.scores["hull"] = self.score(hull.mesh).mean
         if hull.note:
-            self.decisions.append(("hull not trimmed", hull.note))
+            done = f"hull trimmed to what {hull.trim_views} views see" if hull.trim_views else "hull not trimmed"
+            self.decisions.append((done, hull.note))
         return ObjectMesh(hull.mesh, "hull", hull.voxel, flat=False)
 
     def drawn(self) -> ObjectMesh | None:

@@ -18,7 +18,7 @@ from rtgs.errors import RtgsError
 from rtgs.mesh.grid import Grid, bounding_grid, refined, tightened
 from rtgs.mesh.outlines import MaskField, Outline, first_outlines, plain_outlines, refined_outlines
 from rtgs.mesh.settings import AUTOMATIC, HullSettings
-from rtgs.mesh.silhouettes import MaskSet, MaskView, focus_point, silhouette_score
+from rtgs.mesh.silhouettes import MaskSet, MaskView, SilhouetteScore, focus_point, silhouette_score
 from rtgs.mesh.smoothing import main_pieces, surface_of_field, taubin
 from rtgs.mesh.triangles import TriangleMesh
 
@@ -38,8 +38,9 @@ class HullResult:
     voxel: float
     outvoted: int  # k
     medians: tuple[float, ...]  # median IoU of the hulls among which k was chosen, for k = 0, 1, ...; one: k was given
-    trimmed: float | None  # share of the volume that was cut off; None: not tried
-    note: str  # why it was not trimmed, if so
+    trimmed: float | None  # share of the volume that was cut off; None: nothing was
+    trim_views: int  # views that what stayed had to be free in; 0: nothing was cut off
+    note: str  # why it was not trimmed, or not by mesh.object.hull.trim_views, if so
     pieces: int  # connected ones before the small ones went
     kept: int
     hidden: tuple[Tensor, ...]  # (H, W) bool for each mask: pixels at which something opaque may hide the object
@@ -81,7 +82,9 @@ def _explained(field: MaskField, grid: Grid, most: int, settings: HullSettings) 
 def _rough_hull(field: MaskField, grid: Grid, outvoted: int, settings: HullSettings) -> TriangleMesh:
     trial = grid.resampled(min(_TRIAL_VOXELS, settings.voxels))
     values = refined(field.distance(outvoted), trial)
-    values, _, _ = _trimmed(values, trial, [item.view for item in field.outlines], settings)
+    evidence = _evidence(values, trial, [item.view for item in field.outlines], settings)
+    if not isinstance(evidence, str):
+        values, _ = evidence.trimmed(values, settings.trim_views)
     return surface_of_field(values, trial.origin, trial.voxel)
 
 
@@ -92,7 +95,7 @@ def _carved(field: MaskField, grid: Grid, most: int, settings: HullSettings) -> 
         outvoted, medians = _choose_outvoted(trials, field.outlines, settings.tie)
     distance = field.distance(outvoted)
     fine = tightened(distance, tightened(distance, grid)).resampled(settings.voxels)
-    values, trimmed, note = _trimmed(refined(distance, fine), fine, [item.view for item in field.outlines], settings)
+    values, trimmed, needed, note = _trimmed(refined(distance, fine), fine, field.outlines, settings)
     mesh, pieces, kept = main_pieces(surface_of_field(values, fine.origin, fine.voxel), settings.min_piece)
     if len(mesh.faces) == 0:
         raise RtgsError(
@@ -101,7 +104,7 @@ def _carved(field: MaskField, grid: Grid, most: int, settings: HullSettings) -> 
         )
     smooth = taubin(mesh, settings.smoothing)
     hidden = tuple(outline.hidden for outline in field.outlines)
-    return HullResult(smooth, fine.voxel, outvoted, medians, trimmed, note, pieces, kept, hidden)
+    return HullResult(smooth, fine.voxel, outvoted, medians, trimmed, needed, note, pieces, kept, hidden)
 
 
 def most_outvoted(views: int) -> int:
@@ -134,10 +137,7 @@ def _choose_outvoted(
 
     The median, because masks that are wrong disagree with the right hull.
     """
-    views, hidden = [item.view for item in outlines], [item.hidden for item in outlines]
-    medians = [
-        silhouette_score(mesh, views, hidden, _TRIAL_STRIDE).median if len(mesh.faces) else 0.0 for mesh in trials
-    ]
+    medians = [_agreement(mesh, outlines).median if len(mesh.faces) else 0.0 for mesh in trials]
     chosen = 0
     for k in range(1, len(medians)):
         if medians[k] > medians[chosen] + tie:
@@ -145,35 +145,88 @@ def _choose_outvoted(
     return chosen, tuple(medians)
 
 
+def _agreement(mesh: TriangleMesh, outlines: Sequence[Outline]) -> SilhouetteScore:
+    """IoU with the masks, of every few pixels, where nothing may hide the object."""
+    return silhouette_score(mesh, [item.view for item in outlines], [item.hidden for item in outlines], _TRIAL_STRIDE)
+
+
 def _trimmed(
-    values: np.ndarray, grid: Grid, views: Sequence[MaskView], settings: HullSettings
-) -> tuple[np.ndarray, float | None, str]:
-    """The field without what lies behind the base set's surfaces in too many views; share removed; why not, if so.
+    values: np.ndarray, grid: Grid, outlines: Sequence[Outline], settings: HullSettings
+) -> tuple[np.ndarray, float | None, int, str]:
+    """The field without what lies behind the base set's surfaces in too many views; share removed; how many views
+    had to see what stayed; why not, or not ``trim_views``, if so.
 
-    Contents of the container are behind their own surfaces too, and stay: what is cut off is what lies outside the
-    convex hull of the points that are seen to be free.
+    A trained base set's depth is wrong in places, and then the cut goes through the object: masks that showed its
+    pixels are no longer explained. So a cut that costs IoU is made with half the views, and half of them again.
     """
-    from scipy.ndimage import binary_erosion, uniform_filter
+    evidence = _evidence(values, grid, [item.view for item in outlines], settings)
+    if isinstance(evidence, str):
+        return values, None, 0, evidence
+    least = _agreement(surface_of_field(values, grid.origin, grid.voxel), outlines).mean - settings.trim_cost
+    note, needed = "", settings.trim_views
+    while needed > 0:
+        result, share = evidence.trimmed(values, needed)
+        found = _agreement(surface_of_field(result, grid.origin, grid.voxel), outlines).mean
+        if found >= least:
+            return result, share, needed, note
+        note += f"{'; ' * bool(note)}cut off what {needed} views do not see free: silhouette IoU {found:.4f}"
+        note += f", {least + settings.trim_cost:.4f} whole"
+        needed //= 2
+    return values, None, 0, note
 
+
+@dataclass(frozen=True)
+class _Evidence:
+    """In how many views each point of a hull lies in front of the base set's surface, or meets none."""
+
+    grid: Grid
+    inside: np.ndarray  # (X, Y, Z) bool
+    free: np.ndarray  # (X, Y, Z) int, 0 outside
+
+    def seen(self, needed: int) -> np.ndarray:
+        """(X, Y, Z) bool: free in so many views."""
+        seen = self.inside & (self.free >= needed)
+        return seen & (_share_nearby(seen) > 0.13)  # lone voxels are noise
+
+    def trimmed(self, values: np.ndarray, needed: int) -> tuple[np.ndarray, float]:
+        """The field without what lies outside the convex hull of what is free in so many views; share removed.
+
+        Contents of the container are behind their own surfaces too, and stay.
+        """
+        from scipy.ndimage import binary_erosion
+
+        seen, points = self.seen(needed), self.grid.points()
+        near = (values > -2 * self.grid.voxel) & ~np.array(binary_erosion(seen), bool)
+        result = values.copy()
+        result[near] = np.minimum(values[near], _convex_distance(points[near], points[seen], self.grid.voxel))
+        return result, 1 - float((result > 0).sum() / self.inside.sum())
+
+
+def _evidence(values: np.ndarray, grid: Grid, views: Sequence[MaskView], settings: HullSettings) -> _Evidence | str:
+    """What the base set's depth says of the hull; a string: why nothing."""
     deep = [view for view in views if view.depth is not None]
     if not settings.trim:
-        return values, None, "mesh.hull.trim is off"
+        return "mesh.object.hull.trim is off"
     if len(deep) < 2 * settings.trim_views:
-        return values, None, f"{len(deep)} views have depth, too few for mesh.hull.trim_views = {settings.trim_views}"
+        return f"{len(deep)} views have depth, too few for mesh.object.hull.trim_views = {settings.trim_views}"
     inside = values > 0
-    points = grid.points()[inside]
-    free = np.zeros(len(points), np.int64)
+    if not inside.any():
+        return "nothing is left of the hull"
+    points = torch.from_numpy(grid.points()[inside])
+    free = np.zeros(values.shape, np.int64)
     for view in deep:
-        free += _in_front(view, torch.from_numpy(points), settings.trim_margin * grid.voxel)
-    seen = np.zeros(values.shape, bool)
-    seen[inside] = free >= settings.trim_views
-    seen &= uniform_filter(seen.astype(np.float32), 3, mode="constant") > 0.13  # lone voxels are noise
-    if seen.sum() < 0.1 * inside.sum():
-        return values, None, "the base set's depth lies in front of nearly all of the hull"
-    near = (values > -2 * grid.voxel) & ~np.array(binary_erosion(seen), bool)
-    result = values.copy()
-    result[near] = np.minimum(values[near], _convex_distance(grid.points()[near], grid.points()[seen], grid.voxel))
-    return result, 1 - float((result > 0).sum() / inside.sum()), ""
+        free[inside] += _in_front(view, points, settings.trim_margin * grid.voxel)
+    evidence = _Evidence(grid, inside, free)
+    if evidence.seen(settings.trim_views).sum() < 0.1 * inside.sum():
+        return "the base set's depth lies in front of nearly all of the hull"
+    return evidence
+
+
+def _share_nearby(seen: np.ndarray) -> np.ndarray:
+    """(X, Y, Z) share of the 27 voxels around each that are seen."""
+    from scipy.ndimage import uniform_filter
+
+    return uniform_filter(seen.astype(np.float32), 3, mode="constant")
 
 
 def _in_front(view: MaskView, points: Tensor, margin: float) -> np.ndarray:

@@ -41,7 +41,8 @@ class HullSettings:
     min_seen: float = 0.4  # share of the views that must have a point in the picture for it to belong to the object
     smoothing: int = 10  # iterations of Taubin's filter
     trim: bool = True  # cut off what the base set's depth shows to lie behind other surfaces (the unseen bottom)
-    trim_views: int = 8  # views in front of whose depth a point must lie to stay
+    trim_views: int = 8  # views in front of whose depth a point must lie to stay, at first
+    trim_cost: float = 0.003  # silhouette IoU that the cut may cost; else half the views must agree, and so on
     trim_margin: float = 0.5  # voxels that it may lie behind it
     min_piece: float = 0.05  # pieces with a smaller share of the largest one's volume go
     min_views: int = 12  # masks; with fewer the hull is not chosen by mesh.source = auto

@@ -101,6 +101,25 @@ def test_depth_trims_the_unseen_bottom() -> None:
     assert "too few" in few.note
 
 
+def test_a_cut_that_the_masks_contradict_asks_fewer_views() -> None:
+    """Most depths show the table too high: where eight views must see what stays, the sphere loses its lower third."""
+    body = sphere(0.6, 32, (0, 0, 0.6))
+    cameras = [camera for k, camera in enumerate(ring(54, (0, 0, 0.5))) if k % 3]
+    masks = silhouettes(body, cameras)
+    right, wrong = (depths(box((-3, -3, -0.2), (3, 3, top)), cameras) for top in (0.0, 0.4))
+    for good, asked in ((5, 4), (0, 0)):
+        seen = mask_set(cameras, masks, [*right[:good], *wrong[good:]])
+        strict, kept = carve_hull(seen, replace(COARSE, trim_cost=1.0)), carve_hull(seen, COARSE)
+        assert (strict.trim_views, strict.note) == (8, "")
+        assert strict.mesh.vertices[:, 2].min() > 0.3
+        assert kept.trim_views == asked
+        assert "cut off what 8 views do not see free: silhouette IoU 0." in kept.note
+        assert silhouette_score(kept.mesh, seen.views).mean > silhouette_score(strict.mesh, seen.views).mean + 0.02
+        lowest = kept.mesh.vertices[:, 2].min()
+        assert (lowest < -0.08) if asked == 0 else (lowest < 0.05)
+        assert (kept.trimmed is None) == (asked == 0)
+
+
 def test_contents_do_not_hollow_the_container() -> None:
     """What stands inside is behind its own surface in every view; it stays inside the mesh."""
     body, inside = box((-0.6, -0.6, 0.0), (0.6, 0.6, 1.2)), box((-0.3, -0.3, 0.0), (0.3, 0.3, 0.9))
