@@ -1,8 +1,8 @@
-"""Meshes of the stand-ins' containers against the true ones: `python -m benchmarks.mesh [capture folder ...]`.
+"""Meshes of the stand-ins' containers against the true ones: `python -m benchmarks.mesh [scene or folder ...]`.
 
 The hull is carved from the captures' own masks and the exact depth of everything opaque (what a perfect base set would
-have); the TSDF mesh is fused from the exact depth of the *container*, which no base set reaches (docs/mesh.md). Without
-arguments: the shipped ball_statue. Times are CPU seconds of one process.
+have); the TSDF mesh is fused from the exact depth of the *container*, which no base set reaches (docs/mesh.md). Scenes
+are shipped captures, by name (default: ball_statue). Times are CPU seconds of one process.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from rtgs.mesh.settings import HullSettings, TsdfSettings
 from rtgs.mesh.silhouettes import mask_set, silhouette_score
 from rtgs.mesh.triangles import TriangleMesh
 from rtgs.mesh.tsdf import DepthView, fuse_depths, import_open3d, object_fusion
-from rtgs.scenes.embedded import embedded_capture
+from rtgs.scenes.embedded import embedded_capture, embedded_names
 from rtgs.scenes.scene import Scene, load_scene
 from rtgs.scenes.settings import SceneSettings
 from rtgs.scenes.synthetic.description import TRANSPARENT, named_scene
@@ -78,7 +78,8 @@ def measure(name: str, scene: Scene) -> list[str]:
 
 def main() -> None:
     """Print the table and what Open3D costs."""
-    folders = [Path(word) for word in sys.argv[1:]] or [embedded_capture("ball_statue")]
+    words = sys.argv[1:] or ["ball_statue"]
+    folders = [embedded_capture(word) if word in embedded_names() else Path(word) for word in words]
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     start = time.process_time()
     import_open3d()
