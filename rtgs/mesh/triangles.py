@@ -60,7 +60,8 @@ def read_mesh_ply(path: Path) -> TriangleMesh:
     """A triangle mesh from a PLY file.
 
     Raises:
-        RtgsError: not a readable PLY, no faces (a point cloud), or faces that are not triangles.
+        RtgsError: not a readable PLY, no faces (a point cloud), faces that are not triangles or point to no vertex,
+            vertices without x y z, or that are not finite.
     """
     from plyfile import PlyData, PlyParseError
 
@@ -72,6 +73,8 @@ def read_mesh_ply(path: Path) -> TriangleMesh:
     if "vertex" not in names or "face" not in names:
         raise RtgsError(f"{path} has elements {sorted(names)}, a mesh needs vertex and face; is it a point cloud?")
     vertex, face = data["vertex"], data["face"]
+    if not {"x", "y", "z"} <= {item.name for item in vertex.properties}:
+        raise RtgsError(f"{path} has vertices without x y z; export it again")
     vertices = np.stack([np.asarray(vertex[name], np.float32) for name in "xyz"], axis=1)
     rows = list(face[face.properties[0].name])
     if any(len(row) != 3 for row in rows):
@@ -80,7 +83,10 @@ def read_mesh_ply(path: Path) -> TriangleMesh:
     colors = None
     if {"red", "green", "blue"} <= {item.name for item in vertex.properties}:
         colors = np.stack([np.asarray(vertex[name], np.float32) / 255 for name in ("red", "green", "blue")], axis=1)
-    return TriangleMesh(vertices, faces, colors)
+    try:
+        return TriangleMesh(vertices, faces, colors)
+    except ValueError as error:
+        raise RtgsError(f"{path} is not a usable mesh: {error}") from error
 
 
 def write_mesh_obj(path: Path, mesh: TriangleMesh) -> None:

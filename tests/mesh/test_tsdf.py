@@ -186,5 +186,17 @@ def test_files_that_are_no_meshes(tmp_path: Path) -> None:
     (tmp_path / "noise.ply").write_bytes(b"not a ply")
     with pytest.raises(RtgsError, match="not a readable PLY"):
         read_mesh_ply(tmp_path / "noise.ply")
+    for names, place, corner, message in (
+        ("xyz", float("nan"), 2, "broken.ply is not a usable mesh: mesh vertices hold NaN"),
+        ("xyz", 0.0, 9, "broken.ply is not a usable mesh: mesh faces point to vertices"),
+        ("xy", 0.0, 2, "broken.ply has vertices without x y z"),
+    ):
+        vertices = np.full(3, place, dtype=[(name, "f4") for name in names])
+        faces = np.empty(1, dtype=[("vertex_indices", "i4", (3,))])
+        faces["vertex_indices"] = [[0, 1, corner]]
+        described = [PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]
+        PlyData(described).write(str(tmp_path / "broken.ply"))
+        with pytest.raises(RtgsError, match=message):
+            read_mesh_ply(tmp_path / "broken.ply")
     with pytest.raises(ValueError, match="faces point to vertices"):
         TriangleMesh(np.zeros((2, 3)), np.array([[0, 1, 2]]))
