@@ -4,7 +4,7 @@ show."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +15,10 @@ from rtgs.mesh.hull import HullResult, carve_hull
 from rtgs.mesh.pane import drawn_pane, fit_pane, is_flat
 from rtgs.mesh.settings import FLAT, SOURCES, ObjectSettings
 from rtgs.mesh.silhouettes import MaskSet, SilhouetteScore, direction_spread, silhouette_score
+from rtgs.mesh.smoothing import volume
 from rtgs.mesh.triangles import TriangleMesh, read_mesh_obj, read_mesh_ply
 
+_ELSEWHERE = 0.05  # silhouette IoU below which a given mesh is another thing, or in another frame
 Fusion = Callable[[np.ndarray | None], tuple[TriangleMesh, float]]
 """From the object's box (2, 3), None: not known, to the TSDF mesh and its voxel."""
 
@@ -93,13 +95,26 @@ class _Candidates:
         return ObjectMesh(mesh, "tsdf", voxel, flat=self._flat(mesh))
 
     def given(self) -> ObjectMesh:
-        """The mesh of the file."""
-        mesh = read_given(self.settings.given)
+        """The mesh of the file; a closed one that faces inward is turned.
+
+        Raises:
+            RtgsError: no surface, or one that the masks do not show.
+        """
+        path, mesh = self.settings.given, read_given(self.settings.given)
         side = float(np.ptp(mesh.vertices, axis=0).max()) if len(mesh.vertices) else 0.0
-        if len(mesh.faces) == 0 or side == 0:
-            raise RtgsError(f"{self.settings.given} holds no surface: mesh.object.given needs triangles")
-        self.scores["given"] = self.score(mesh).mean
-        return ObjectMesh(mesh, "given", side / self.settings.hull.voxels, flat=self._flat(mesh))
+        if not mesh.face_normals().any():
+            raise RtgsError(f"{path} holds no surface: mesh.object.given needs triangles")
+        self.scores["given"] = score = self.score(mesh).mean
+        if score < _ELSEWHERE:
+            raise RtgsError(
+                f"{path} is not where the masks show the object (silhouette IoU {score:.3f}): it must be in the "
+                "capture's world frame and of its size"
+            )
+        found = ObjectMesh(mesh, "given", side / self.settings.hull.voxels, flat=self._flat(mesh))
+        if not found.closed or volume(mesh) >= 0:
+            return found
+        self.decisions.append(("given mesh turned inside out", "its triangles face inward"))
+        return replace(found, mesh=replace(mesh, faces=mesh.faces[:, ::-1]))
 
     def _flat(self, mesh: TriangleMesh) -> bool:
         return is_flat(mesh) if self.settings.flat == "auto" else self.settings.flat == "yes"

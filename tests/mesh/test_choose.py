@@ -159,6 +159,19 @@ def test_given_meshes(tmp_path: Path) -> None:
         assert choice.mesh.source == "given"
         assert choice.iou.mean > 0.97
         assert choice.mesh.voxel == pytest.approx(1.6 / 40, rel=0.01)
+    write_mesh_ply(tmp_path / "inward.ply", replace(body, faces=body.faces[:, ::-1]))
+    turned = chosen("given", masks, replace(SETTINGS, given=str(tmp_path / "inward.ply")))
+    np.testing.assert_array_equal(turned.mesh.mesh.faces, body.faces)
+    assert "given mesh turned inside out" in [what for what, _ in turned.decisions]
+    line = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0]])
+    for name, mesh, message in (
+        ("far.ply", replace(body, vertices=body.vertices + 500), r"far.ply is not where the masks show .* frame"),
+        ("small.ply", replace(body, vertices=0.01 * body.vertices), "small.ply is not where the masks show"),
+        ("line.ply", TriangleMesh(line, np.array([[0, 1, 2]])), "holds no surface"),
+    ):
+        write_mesh_ply(tmp_path / name, mesh)
+        with pytest.raises(RtgsError, match=message):
+            chosen("given", masks, replace(SETTINGS, given=str(tmp_path / name)))
     nothing = TriangleMesh(np.zeros((3, 3), np.float32), np.zeros((0, 3), np.int32))
     write_mesh_ply(tmp_path / "nothing.ply", nothing)
     with pytest.raises(RtgsError, match=r"no faces|holds no surface"):
