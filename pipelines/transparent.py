@@ -50,6 +50,7 @@ def find_transparency(config: RunConfig, prepared: Preparation) -> Transparency:
 
 
 def _mask_files(config: RunConfig) -> list[Path]:
+    from rtgs.scenes.images import MASK_SUFFIXES
     from rtgs.scenes.importers import read_capture
 
     scene = config.scene
@@ -59,4 +60,4 @@ def _mask_files(config: RunConfig) -> list[Path]:
     if not scene.masks_dir or not source.path.is_dir():
         return []
     folder = source.path / scene.masks_dir
-    return sorted(path for path in folder.rglob("*") if path.suffix.lower() == ".png") if folder.is_dir() else []
+    return sorted(path for path in folder.rglob("*") if path.suffix in MASK_SUFFIXES) if folder.is_dir() else []

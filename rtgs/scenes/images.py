@@ -62,12 +62,14 @@ def has_alpha(path: Path) -> bool:
 
 
 def read_mask(path: Path) -> np.ndarray:
-    """Read a mask as (H, W) bool: True where any colour channel is non-zero and alpha, if any, is not zero.
+    """Read a mask as (H, W) bool: True where any colour channel is non-zero and alpha, if any, is not zero. Of a JPEG,
+    whose black is not exact: where a channel is at least half of white.
 
     Raises:
         CaptureError: as :func:`read_photo`.
     """
     with _open(path) as picture:
+        lossy = picture.format in ("JPEG", "MPO")
         try:
             picture.load()
             if _has_alpha(picture):
@@ -76,6 +78,8 @@ def read_mask(path: Path) -> np.ndarray:
                 pixels = np.asarray(picture.convert("RGB") if picture.mode in ("P", "CMYK", "YCbCr") else picture)
         except _READ_ERRORS as error:
             raise _unreadable(path, error) from error
+    if lossy:
+        pixels = pixels > 127
     if pixels.ndim == 2:
         return pixels != 0
     mask = (pixels[..., :3] != 0).any(-1)

@@ -99,6 +99,17 @@ def test_masks_are_non_zero_pixels(tmp_path):
     np.testing.assert_array_equal(read_mask(saved(tmp_path, labels)), mask > 0)
 
 
+@pytest.mark.parametrize("mode", ["L", "RGB", "CMYK"])
+def test_the_black_of_a_jpeg_mask_is_not_exact(tmp_path, mode):
+    y, x = np.mgrid[:48, :64]
+    disc = (x - 31.5) ** 2 + (y - 23.5) ** 2 < 15**2
+    path = tmp_path / "mask.jpg"
+    Image.fromarray(disc.astype(np.uint8) * 255).convert(mode).save(path, quality=60)
+    raw = np.asarray(Image.open(path).convert("L"))
+    assert int(((raw > 0) & ~disc).sum()) > 50, "blocks at the outline are grey"
+    assert int((read_mask(path) != disc).sum()) <= 4
+
+
 def test_normals_of_both_kinds_and_frames(tmp_path):
     normals = np.random.default_rng(1).normal(size=(5, 7, 3))
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
