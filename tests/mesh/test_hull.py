@@ -63,6 +63,19 @@ def test_convex_bodies_from_clean_masks(name: str) -> None:
     assert hits.second > 0.95
 
 
+def test_the_hull_is_smoothed() -> None:
+    """Facets of the cones and steps of the pixels: rounds of Taubin's filter bring the normals nearer to the truth."""
+    masks = masks_of(sphere(0.8, 32), ring(24))
+    rough, smooth = (carve_hull(masks, replace(COARSE, smoothing=rounds)).mesh for rounds in (0, 10))
+
+    def degrees(mesh: TriangleMesh) -> float:
+        normals, middle = mesh.face_normals(), mesh.vertices[mesh.faces].mean(1, dtype=np.float64)
+        cosine = (normals * middle).sum(1) / np.linalg.norm(normals, axis=1) / np.linalg.norm(middle, axis=1)
+        return float(np.degrees(np.arccos(cosine.clip(-1, 1))).mean())
+
+    assert degrees(smooth) < 0.8 * degrees(rough)
+
+
 def test_broken_masks_are_outvoted() -> None:
     """Three masks lack half the object: as carved they take half of it away."""
     body = sphere(0.8, 32)

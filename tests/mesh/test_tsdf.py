@@ -1,6 +1,7 @@
 """Fusion of analytic depths, the pieces that stay, and the files."""
 
 import builtins
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from rtgs.mesh.tsdf import (
     fuse_depths,
     fusion_lengths,
     largest_pieces,
+    object_fusion,
     unpacked,
     usable_depth,
 )
@@ -115,6 +117,31 @@ def test_every_block_with_a_surface_point_is_found() -> None:
     rays = view.camera.rays(torch.float64)
     points = (rays.origin + view.depth.double()[..., None] * rays.directions)[view.depth > 0].numpy()
     assert {tuple(block) for block in np.floor(points / (8 * voxel)).astype(int)} <= blocks
+
+
+def test_an_object_is_fused_in_its_box_at_a_voxel_of_its_own() -> None:
+    views = sphere_views(12)
+    cameras = [view.camera for view in views]
+    box = np.array([[-1.1, -1.1, 0.2], [1.1, 1.1, 1.1]])  # the upper part of the ball
+    pixel = 3.0 / 150  # at the box's middle, about
+    settings, crop = object_fusion(TsdfSettings(depth_trunc=6.0), 40, 7, cameras, box)
+    assert (settings.voxel, settings.keep_clusters) == (pytest.approx(2.2 / 40), 7)
+    fine, _ = object_fusion(TsdfSettings(), 4096, 7, cameras, box)
+    assert fine.voxel == pytest.approx(pixel, rel=0.1), "no finer than a pixel"
+    assert object_fusion(TsdfSettings(voxel=0.3), 40, 7, cameras, box)[0].voxel == 0.3
+    half = torch.zeros(112, 128, dtype=torch.bool)
+    half[:, :64] = True
+    for view in (views[0], replace(views[0], mask=half)):
+        points = view.camera.rays(torch.float64)
+        height = (points.origin + view.depth[..., None] * points.directions)[..., 2]
+        mask = crop(view).mask
+        assert mask is not None
+        expected = (view.depth > 0) & (height >= 0.2)
+        assert torch.equal(mask & (view.depth > 0), expected if view.mask is None else expected & half)
+    mesh = fuse_depths(map(crop, views), cameras, settings).mesh
+    assert mesh.vertices[:, 2].min() > 0.2 - 2 * settings.voxel
+    assert mesh.vertices[:, 2].max() > 0.9
+    assert object_fusion(TsdfSettings(), 40, 7, cameras, None)[1](views[0]) is views[0]
 
 
 def test_small_pieces_go() -> None:

@@ -7,8 +7,10 @@ from dataclasses import replace
 import pytest
 import torch
 from glass_cases import GlassScene, begun, glass_recipe, glass_scene, held, new_glass_method, train_stages
+from mirror_scene import BALL
 
-from rtgs.methods.interface_set import normal_quaternions
+from rtgs.gaussians.density import select_rows
+from rtgs.methods.interface_set import interface_surfels, normal_quaternions
 from rtgs.train.specular_settings import InterfaceSettings
 
 
@@ -92,3 +94,19 @@ def test_held_normals_stay_nearer_to_the_mesh(made: GlassScene):
         assert method.interface is not None
         turned.append(float(method.interface.turned().detach()))
     assert turned[1] < 0.5 * turned[0]
+
+
+def test_the_interface_begins_with_the_colours_of_what_is_next_to_it(made: GlassScene):
+    """Of two base surfels on either side of the ball, each gives its own half its colour."""
+    method = new_glass_method(glass_recipe(), made)
+    base = select_rows(method.base.surfels, torch.tensor([0, 1]))
+    with torch.no_grad():
+        base.means.copy_(BALL + torch.tensor([[2.0, 0, 0], [-2.0, 0, 0]]))
+        base.sh_dc.copy_(torch.tensor([[1.0, 0, 0], [0, 0, 1.0]]))
+    glass = torch.ones(len(made.mesh.mesh.faces), dtype=torch.bool)
+    generator = torch.Generator().manual_seed(0)
+    surfels = interface_surfels(method.settings, made.mesh, glass, base, generator)  # type: ignore[arg-type]
+    right = surfels.means[:, 0] > BALL[0]
+    assert 0.3 < float(right.float().mean()) < 0.7
+    assert torch.equal(surfels.sh_dc[:, 0] == 1, right)
+    assert torch.equal(surfels.sh_dc[:, 2] == 1, ~right)
