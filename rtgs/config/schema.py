@@ -10,14 +10,16 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from rtgs.mesh.settings import ObjectSettings, TsdfSettings
+from rtgs.mesh.settings import FLAT, SOURCES, ObjectSettings, TsdfSettings
 from rtgs.prepare.masks_settings import MaskSettings
 from rtgs.prepare.settings import NormalSettings, SfmSettings
 from rtgs.scenes.settings import SceneSettings
+from rtgs.train.refuse import refuse_unless
 from rtgs.train.settings import MethodSettings, ScheduleSettings
 
 SCHEMA_NAME = "run_schema"
 _DOT = "__"  # in the names of twins
+MESH_OF = ("object", "scene")
 
 
 @dataclass(frozen=True)
@@ -97,6 +99,11 @@ class MeshConfig:
     object: ObjectSettings = field(default_factory=ObjectSettings)
     """How that mesh is found."""
     tsdf: TsdfSettings = field(default_factory=TsdfSettings)
+
+    def __post_init__(self) -> None:
+        choices = {"source": (self.source, SOURCES), "of": (self.of, MESH_OF), "object.flat": (self.object.flat, FLAT)}
+        for key, (value, allowed) in choices.items():
+            refuse_unless(value in allowed, f"mesh.{key}", value, " or ".join(allowed))
 
 
 @dataclass(frozen=True)

@@ -130,6 +130,19 @@ def test_a_mistake_in_a_file_names_file_and_key(conf_copy, group, content, expec
         assert part in text
 
 
+@pytest.mark.parametrize(
+    ("word", "expected"),
+    [
+        ("mesh.source=hul", "mesh.source=hul must be auto or hull or tsdf or given"),
+        ("mesh.of=objct", "mesh.of=objct must be object or scene"),
+        ("mesh.object.flat=maybe", "mesh.object.flat=maybe must be auto or yes or no"),
+    ],
+)
+def test_a_choice_of_the_mesh_is_checked_before_anything_is_trained(word, expected):
+    with pytest.raises(ValueError, match=expected):
+        compose([word])
+
+
 @pytest.mark.parametrize("name", ["../elsewhere", "a/b", "..", "/tmp/run"])
 def test_a_run_stays_in_its_folder(name):
     with pytest.raises(RtgsError, match="one folder in runs/"):
