@@ -140,6 +140,10 @@ def test_seen_through_a_hole_there_is_no_pair() -> None:
     assert torch.equal(seen.far[through], seen.near[through])
     assert (seen.normal[2][through] > 0).all()  # facing the camera
     assert guide.counts()["one_hit"] >= int(through.sum())
+    below = join(with_hole(sphere(1.0, 24)), sphere(1.0, 24, (0, 0, -3)))  # more to meet behind the bottom
+    seen = ObjectGuide(container(below, voxel=0.02)).surfaces(camera)
+    assert seen.hit[through].all()
+    assert not seen.second[through].any()
 
 
 def test_pane_has_one_surface_and_nothing_inside() -> None:

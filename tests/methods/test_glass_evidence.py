@@ -13,11 +13,12 @@ from reflective_cases import schedule
 from torch import Tensor
 
 from rtgs.cameras import Camera
-from rtgs.mesh.container import ObjectGuide
+from rtgs.mesh.container import ObjectGuide, ObjectSurfaces
 from rtgs.methods import RenderOptions
-from rtgs.methods.glass import widened
+from rtgs.methods.glass import glass_pixels, widened
 from rtgs.methods.glass_evidence import glass_faces, on_surface, seen_bare
 from rtgs.methods.interface_set import normal_quaternions
+from rtgs.methods.mirror import SurfacePixels
 from rtgs.methods.transmittance import TransmissiveMethod
 from rtgs.scenes.scene import View
 from rtgs.train.specular_settings import InterfaceSettings
@@ -194,6 +195,27 @@ def test_one_masked_view_is_enough_to_train(plain: GlassScene):
     assert method.transparent
     for part in method.sets:
         assert all(bool(torch.isfinite(tensor).all()) for _, tensor in part.surfels.items())
+
+
+def test_the_mesh_is_the_first_surface_where_it_is_glass():
+    """Pixels: glass, a lid, outside the mask, no hit; the mesh at 2 to 4, of the lid to 2.5, the base set at 3."""
+    count = 4
+    plain, axis = torch.zeros(count), torch.tensor([[0.0], [0.0], [-1.0]]).expand(3, count)
+    flat = SurfacePixels(torch.zeros(3, count), plain, plain, plain, axis, torch.full((count,), 3.0))
+    hit = torch.tensor([[True, True, True, False]])
+    far = torch.tensor([[4.0, 2.5, 4.0, 0.0]])
+    turned = torch.tensor([0.0, 1.0, 0.0]).view(3, 1, 1).expand(3, 1, count)
+    triangle = torch.zeros(1, count, dtype=torch.int32)
+    surfaces = ObjectSurfaces(hit, torch.where(hit, 2.0, 0.0), far, hit, turned, triangle)
+    inside, glass = torch.tensor([[True, True, False, True]]), torch.tensor([[True, False, True, False]])
+    found = glass_pixels(flat, surfaces, inside, glass, first_surface="mesh", normal="mesh")
+    assert found.flat.depth.tolist() == [2.0, 3.0, 3.0, 3.0]
+    assert found.flat.normal[1].tolist() == [1.0, 0.0, 0.0, 0.0]
+    assert found.second.tolist() == [True, True, False, False]
+    assert found.far.tolist() == [4.0, 3.0, 3.0, 3.0], "the back is never before the front"
+    base = glass_pixels(flat, surfaces, inside, glass, first_surface="base", normal="base").flat
+    assert torch.equal(base.depth, flat.depth)
+    assert torch.equal(base.normal, flat.normal)
 
 
 def test_widened_masks():
