@@ -52,7 +52,7 @@ def object_params(config: RunConfig) -> ExtractMeshParams:
     """Parameters of the transparent object's mesh.
 
     Raises:
-        RtgsError: mesh.source is given and there is no such file.
+        RtgsError: mesh.source is given and there is no such file, or it holds no mesh.
     """
     mesh = config.mesh
     chosen = mesh.object
@@ -60,6 +60,9 @@ def object_params(config: RunConfig) -> ExtractMeshParams:
         file = Path(chosen.given)
         if not chosen.given or not file.is_file():
             raise RtgsError(f"mesh.source=given needs mesh.object.given, a PLY or OBJ file; {chosen.given!r} is none")
+        from rtgs.mesh.choose import read_given
+
+        read_given(chosen.given)  # refuses a broken one before two stages are trained
         digest = hashlib.sha256(file.read_bytes()).hexdigest()
         chosen = replace(chosen, given=str(file.resolve()), given_sha256=digest)
     return ExtractMeshParams(mesh.tsdf, mesh.of == "object", mesh.depth_ratio, mesh.obj, mesh.source, chosen)
@@ -278,7 +281,7 @@ def _sizes(mesh: TriangleMesh) -> dict[str, float]:
 
 STEP = StepKind(
     "extract_mesh",
-    4,
+    5,
     extract_mesh,
     helpers=(
         "pipelines.training",

@@ -81,6 +81,7 @@ def build_graph(config: RunConfig, choices: Choices) -> RunGraph:
         CaptureError: the capture cannot be read.
         ValueError: no method of this name.
     """
+    config = _as_asked(config)
     prepared = prepare(config)
     scene = prepared.scene
     transparency = find_transparency(config, prepared)
@@ -102,6 +103,13 @@ def build_graph(config: RunConfig, choices: Choices) -> RunGraph:
     params = _report_params(config, choices, skipped)
     page = report.STEP.step(params, *prepared.steps, scene, *training, *made)
     return RunGraph(scene, training, rendered, measured, page, mesh, skipped)
+
+
+def _as_asked(config: RunConfig) -> RunConfig:
+    """``masks=none``: not those that the capture brings either."""
+    if config.masks.source != "none":
+        return config
+    return replace(config, scene=replace(config.scene, masks_dir=""))
 
 
 def _left_out(config: RunConfig, transparency: Transparency, object_mesh: Step | None) -> tuple[SkippedStep, ...]:

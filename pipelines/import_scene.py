@@ -75,7 +75,7 @@ def import_scene(params: ImportParams, context: StepContext) -> None:
 
 STEP = StepKind(
     "import_scene",
-    3,
+    4,
     import_scene,
     helpers=(
         "rtgs.scenes.canonical",

@@ -42,9 +42,8 @@ def find_transparency(config: RunConfig, prepared: Preparation) -> Transparency:
             return Transparency(True, f"{path.name} shows a transparent object")
         full += share >= COVERED
     if full:
-        why = (
-            f"{full} of {len(files)} masks cover the whole picture, the others are empty: nothing tells glass from room"
-        )
+        others = "" if full == len(files) else ", the others are empty"
+        why = f"{full} of {len(files)} masks cover the whole picture{others}: nothing tells glass from room"
         return Transparency(False, why)
     return Transparency(False, f"all {len(files)} masks of the scene are empty")
 

@@ -18,6 +18,9 @@ from rtgs.mesh.silhouettes import MaskSet, SilhouetteScore, direction_spread, si
 from rtgs.mesh.smoothing import volume
 from rtgs.mesh.triangles import TriangleMesh, read_mesh_obj, read_mesh_ply
 
+_REMEDY = (
+    "mask it in more photos, give its mesh (mesh.source=given), or train without the third stage (ablation=two_stages)"
+)
 _ELSEWHERE = 0.05  # silhouette IoU below which a given mesh is another thing, or in another frame
 Fusion = Callable[[np.ndarray | None], tuple[TriangleMesh, float]]
 """From the object's box (2, 3), None: not known, to the TSDF mesh and its voxel."""
@@ -143,7 +146,13 @@ def choose_object_mesh(
             f"{', '.join(FLAT)})"
         )
     tried = _Candidates(masks, settings, fuse, panes)
-    mesh = {"hull": _hull_or_pane, "auto": _automatic}.get(source, lambda found: getattr(found, _MADE[source])())(tried)
+    make = {"hull": _hull_or_pane, "auto": _automatic}.get(source, lambda found: getattr(found, _MADE[source])())
+    try:
+        mesh = make(tried)
+    except RtgsError as error:
+        if source != "hull":
+            raise
+        raise RtgsError(f"{error}: {_REMEDY}") from error
     about = f"{len(masks.views)} masks, {masks.cut} cut by the image border"
     left = [f"{masks.without} views have no mask", f"{masks.empty} masks are empty", f"{masks.full} cover everything"]
     about += "".join(f", {text}" for text, count in zip(left, (masks.without, masks.empty, masks.full)) if count)
@@ -200,23 +209,22 @@ def _automatic(tried: _Candidates) -> ObjectMesh:
         tried.decisions.append(("no hull", str(error)))
     if first is not None and first.flat:
         return first
-    if not trusted:
+    if first is not None and not trusted:
         why = f"{len(masks.views)} masks (mesh.object.hull.min_views {hull.min_views}) from directions {spread:.0f} "
         tried.decisions.append(("hull not chosen", f"{why}degrees apart at most (min_spread {hull.min_spread:g})"))
     elif first is not None and tried.scores["hull"] >= tried.settings.accept:
         return first
     try:
         fused = tried.fused()
+        if (score := tried.scores["tsdf"]) < (least := tried.settings.tsdf_accept):
+            raise RtgsError(f"its silhouette IoU with the masks is {score:.3f} (mesh.object.tsdf_accept {least:g})")
     except RtgsError as error:
         tried.decisions.append(("no TSDF mesh", str(error)))
         if first is None:
-            reasons = "; ".join(f"{what}: {why}" for what, why in tried.decisions)
-            raise RtgsError(
-                f"no mesh of the transparent object can be made ({reasons}): mask it in more photos, give its mesh "
-                "(mesh.source=given), or train without the third stage (ablation=two_stages)"
-            ) from error
+            reasons = "; ".join(f"{what}: {why}" for what, why in dict(tried.decisions).items())
+            raise RtgsError(f"no mesh of the transparent object can be made ({reasons}): {_REMEDY}") from error
         return first
-    better = first is None or not trusted or tried.scores["tsdf"] > tried.scores["hull"]
+    better = first is None or not trusted or score > tried.scores["hull"]
     return fused if better or first is None else first
 
 

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from rtgs.train.refuse import refuse_bad_numbers, refuse_unless
+
 SOURCES = ("auto", "hull", "tsdf", "given")
 FLAT = ("auto", "yes", "no")
 COVERED = 0.999  # share of the picture from which on a mask says that everything is the object
@@ -29,6 +31,14 @@ class TsdfSettings:
     min_triangles: int = 50  # pieces with fewer go in any case (2DGS)
     max_blocks: int = 400_000  # of 8^3 voxels, 8 GB at the end; beyond it the fusion stops with an error
 
+    def __post_init__(self) -> None:
+        refuse_bad_numbers(self, "mesh.tsdf")
+        for name in ("depth_trunc_radii", "truncation_voxels"):
+            refuse_unless(getattr(self, name) > 0, f"mesh.tsdf.{name}", getattr(self, name), "above 0")
+        refuse_unless(self.min_alpha <= 1, "mesh.tsdf.min_alpha", self.min_alpha, "between 0 and 1")
+        for name, least in {"resolution": 2, "keep_clusters": 0, "min_triangles": 0, "max_blocks": 1}.items():
+            _at_least(least, f"mesh.tsdf.{name}", getattr(self, name))
+
 
 @dataclass(frozen=True)
 class HullSettings:
@@ -48,6 +58,15 @@ class HullSettings:
     min_views: int = 12  # masks; with fewer the hull is not chosen by mesh.source = auto
     min_spread: float = 60.0  # degrees between the two farthest views; with less the hull is not chosen either
 
+    def __post_init__(self) -> None:
+        refuse_bad_numbers(self, "mesh.object.hull")
+        for name in ("tie", "explained", "min_seen", "trim_cost", "min_piece"):
+            value = getattr(self, name)
+            refuse_unless(value <= 1, f"mesh.object.hull.{name}", value, "between 0 and 1")
+        least = {"voxels": 8, "outvoted": AUTOMATIC, "smoothing": 0, "trim_views": 1, "min_views": 3}
+        for name, smallest in least.items():
+            _at_least(smallest, f"mesh.object.hull.{name}", getattr(self, name))
+
 
 @dataclass(frozen=True)
 class PaneSettings:
@@ -57,6 +76,11 @@ class PaneSettings:
     better: float = 0.02  # IoU by which a hull, where there can be one, must beat it
     min_views: int = 3
     min_spread: float = 10.0  # degrees between the two farthest views: below, every plane explains them
+
+    def __post_init__(self) -> None:
+        refuse_bad_numbers(self, "mesh.object.pane")
+        refuse_unless(self.agree <= 1, "mesh.object.pane.agree", self.agree, "between 0 and 1")
+        _at_least(1, "mesh.object.pane.min_views", self.min_views)
 
 
 @dataclass(frozen=True)
@@ -71,9 +95,23 @@ class ObjectSettings:
     """A pane of glass: one wall, nothing inside. ``yes``, ``no``, or ``auto``: whether one plane explains the masks."""
     accept: float = 0.95
     """Silhouette IoU from which on ``auto`` takes the hull without making a TSDF mesh to compare it with."""
+    tsdf_accept: float = 0.5
+    """Silhouette IoU below which ``auto`` takes no TSDF mesh: better a hull of too few masks, or an error."""
     tsdf_resolution: int = 256
     """Voxels along the object's longest side for the TSDF mesh; no finer than ``mesh.tsdf.finest_pixels``."""
     tsdf_pieces: int = 5
     """Largest connected pieces of the TSDF mesh that stay."""
     hull: HullSettings = field(default_factory=HullSettings)
     pane: PaneSettings = field(default_factory=PaneSettings)
+
+    def __post_init__(self) -> None:
+        refuse_bad_numbers(self, "mesh.object")
+        for name in ("accept", "tsdf_accept"):
+            value = getattr(self, name)
+            refuse_unless(value <= 1, f"mesh.object.{name}", value, "between 0 and 1")
+        _at_least(2, "mesh.object.tsdf_resolution", self.tsdf_resolution)
+        _at_least(1, "mesh.object.tsdf_pieces", self.tsdf_pieces)
+
+
+def _at_least(least: int, key: str, value: int) -> None:
+    refuse_unless(value >= least, key, value, f"at least {least}")

@@ -88,7 +88,8 @@ def why_unbounded(masks: Sequence[Tensor | None]) -> str:
         return ""
     empty = shares.count(0.0)
     if full := len(shares) - empty:
-        return f"{full} masks cover the whole picture and {empty} are empty: nothing tells object from scene"
+        others = f" and {empty} are empty" if empty else ""
+        return f"{full} masks cover the whole picture{others}: nothing tells object from scene"
     return f"all {empty} masks are empty" if empty else "there are no masks"
 
 

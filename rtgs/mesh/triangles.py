@@ -110,9 +110,13 @@ def read_mesh_obj(path: Path) -> TriangleMesh:
         for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
             words = line.split()
             if words[:1] == ["v"]:
+                if len(words) < 4:
+                    raise ValueError(f"{line!r}: a vertex has three coordinates")
                 vertices.append([float(word) for word in words[1:4]])
             elif words[:1] == ["f"]:
                 numbers = [int(word.split("/")[0]) for word in words[1:]]
+                if 0 in numbers:
+                    raise ValueError(f"{line!r}: vertices are counted from 1")
                 corner = [number - 1 if number > 0 else len(vertices) + number for number in numbers]
                 faces += [(corner[0], corner[k], corner[k + 1]) for k in range(1, len(corner) - 1)]
         mesh = TriangleMesh(np.array(vertices).reshape(-1, 3), np.array(faces).reshape(-1, 3))

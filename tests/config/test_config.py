@@ -136,6 +136,14 @@ def test_a_mistake_in_a_file_names_file_and_key(conf_copy, group, content, expec
         ("mesh.source=hul", "mesh.source=hul must be auto or hull or tsdf or given"),
         ("mesh.of=objct", "mesh.of=objct must be object or scene"),
         ("mesh.object.flat=maybe", "mesh.object.flat=maybe must be auto or yes or no"),
+        ("mesh.object.hull.voxels=0", "mesh.object.hull.voxels=0 must be at least 8"),
+        ("mesh.object.hull.min_seen=2.0", "mesh.object.hull.min_seen=2.0 must be between 0 and 1"),
+        ("mesh.object.hull.trim_cost=-1", "mesh.object.hull.trim_cost=-1.0 must be a finite number of at least 0"),
+        ("mesh.object.pane.agree=2", "mesh.object.pane.agree=2.0 must be between 0 and 1"),
+        ("mesh.object.tsdf_accept=5", "mesh.object.tsdf_accept=5.0 must be between 0 and 1"),
+        ("mesh.object.tsdf_pieces=0", "mesh.object.tsdf_pieces=0 must be at least 1"),
+        ("mesh.tsdf.truncation_voxels=0", "mesh.tsdf.truncation_voxels=0.0 must be above 0"),
+        ("mesh.tsdf.max_blocks=0", "mesh.tsdf.max_blocks=0 must be at least 1"),
     ],
 )
 def test_a_choice_of_the_mesh_is_checked_before_anything_is_trained(word, expected):

@@ -79,8 +79,30 @@ def test_few_views_or_directions_make_no_hull() -> None:
     assert "7 views have no mask" in choice.decisions[0][1]
     with pytest.raises(RtgsError, match="no mesh of the transparent object can be made"):
         chosen("auto", one)
-    with pytest.raises(RtgsError, match="neither a hull nor a pane"):
+    with pytest.raises(RtgsError, match=r"neither a hull nor a pane .*ablation=two_stages"):
         chosen("hull", one)
+
+
+def test_auto_takes_no_tsdf_mesh_that_the_masks_contradict() -> None:
+    """Few masks distrust the hull, but a lump elsewhere is worse; without a hull either there is no mesh."""
+    body = sphere(0.8, 24)
+    few = masks_of(body, ring(8))
+
+    def lump(box: np.ndarray | None) -> tuple[TriangleMesh, float]:
+        return sphere(0.3, 12, (0.5, 0, 0)), 0.02
+
+    choice = chosen("auto", few, fuse=lump)
+    assert choice.mesh.source == "hull"
+    (why,) = [why for what, why in choice.decisions if what == "no TSDF mesh"]
+    assert "silhouette IoU with the masks is 0.1" in why
+    assert "mesh.object.tsdf_accept 0.5" in why
+    assert chosen("auto", few, replace(SETTINGS, tsdf_accept=0.05), lump).mesh.source == "tsdf"
+    assert chosen("tsdf", few, fuse=lump).mesh.source == "tsdf"  # asked for: made
+    one = mask_set(ring(8), [few.views[0].mask, *[None] * 7])
+    with pytest.raises(RtgsError, match="no mesh of the transparent object can be made") as caught:
+        chosen("auto", one, fuse=lump)
+    assert str(caught.value).count("1 usable mask") == 1
+    assert str(caught.value).count("ablation=two_stages") == 1
 
 
 def test_masks_of_a_pane_give_a_pane() -> None:
@@ -179,12 +201,16 @@ def test_given_meshes(tmp_path: Path) -> None:
     (tmp_path / "quad.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvn 0 0 1\nf 1/1/1 2//1 -2 4\n")
     assert len(read_mesh_obj(tmp_path / "quad.obj").faces) == 2
     (tmp_path / "points.obj").write_text("v 0 0 0\n")
+    (tmp_path / "zero.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nf 0 1 2\n")
+    (tmp_path / "short.obj").write_text("v 0 0\nv 1 0 0\nv 1 1 0\nf 1 2 3\n")
     (tmp_path / "mesh.stl").write_text("solid")
     for path, message in (
         ("", "needs mesh.object.given"),
         (str(tmp_path / "none.ply"), "needs mesh.object.given"),
         (str(tmp_path / "mesh.stl"), "only .ply and .obj"),
         (str(tmp_path / "points.obj"), "no faces"),
+        (str(tmp_path / "zero.obj"), "zero.obj is not a readable OBJ: 'f 0 1 2': vertices are counted from 1"),
+        (str(tmp_path / "short.obj"), "'v 0 0': a vertex has three coordinates"),
     ):
         with pytest.raises(RtgsError, match=message):
             read_given(path)

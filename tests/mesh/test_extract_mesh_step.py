@@ -194,3 +194,6 @@ def test_a_given_mesh_belongs_to_the_plan(tmp_path: Path) -> None:
     first = step.object_params(config).object.given_sha256
     write_mesh_ply(file, sphere(1.1, 8))
     assert first != step.object_params(config).object.given_sha256
+    file.write_bytes(file.read_bytes()[:200])
+    with pytest.raises(RtgsError, match=r"mesh\.ply"):
+        step.object_params(config)

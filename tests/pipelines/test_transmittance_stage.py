@@ -100,6 +100,12 @@ def test_only_scenes_with_masks_that_show_something_get_the_third_stage(glass: P
         assert without.training[-1].params.until == 12
         assert any(step.name == "train_transmittance" and why in step.why for step in without.skipped)
         _same_run(without, graph_of(without_glass, "ablation=two_stages"))
+    aside = graph_of(glass, "masks=none")
+    assert [step.name for step in aside.training] == ["train_diffuse", "train_reflection"]
+    assert aside.scene.fingerprint != full.scene.fingerprint
+    assert ("train_transmittance", "the scene has no masks of transparent objects") in {
+        (step.name, step.why) for step in aside.skipped
+    }
     two = graph_of(glass, "ablation=two_stages")
     assert [step.name for step in two.training] == ["train_diffuse", "train_reflection"]
     assert two.training[-1].params.until == 12
