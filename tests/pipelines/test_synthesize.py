@@ -156,7 +156,7 @@ def test_without_llvm_the_scalar_variant_renders_and_says_so(scene, monkeypatch,
     monkeypatch.setattr(variants, "find_llvm", lambda: None)
     with caplog.at_level("INFO"):
         assert main(["run", "synthesize", *[word for word in scene if not word.startswith("variant")]]) == 0
-    assert "scalar_rgb, no LLVM 15 to 20 was found" in caplog.text
+    assert "scalar_rgb, no LLVM 17 to 20 was found" in caplog.text
 
 
 def test_output_never_replaces_what_is_no_synthetic_capture(scene, tmp_path, capsys):

@@ -10,14 +10,13 @@ from rtgs.errors import RtgsError
 
 LLVM_VARIANT, SCALAR_VARIANT = "llvm_ad_rgb", "scalar_rgb"
 
-# LLVM 14 crashes on AVX-512 machines; these are looked for at run time, newest first.
+# Looked for at run time, newest first. Dr.Jit 1.5 writes llvm.minimum, which LLVM 15 and 16 cannot select on x86: the
+# process aborts, and no exception can be caught. LLVM 14 crashes on AVX-512 machines.
 LLVM_NAMES = (
     "libLLVM.so.20.1",
     "libLLVM.so.19.1",
     "libLLVM-18.so.1",
     "libLLVM-17.so.1",
-    "libLLVM-16.so.1",
-    "libLLVM-15.so.1",
 )
 LLVM_FOLDERS = (
     "/usr/lib/x86_64-linux-gnu",
@@ -29,7 +28,7 @@ LLVM_FOLDERS = (
 
 
 def find_llvm() -> Path | None:
-    """The shared library that Mitsuba's fast variant needs: ``DRJIT_LIBLLVM_PATH`` or a system LLVM 15 to 20."""
+    """The shared library that Mitsuba's fast variant needs: ``DRJIT_LIBLLVM_PATH`` or a system LLVM 17 to 20."""
     if given := os.environ.get("DRJIT_LIBLLVM_PATH"):
         return Path(given)
     candidates = (Path(folder) / name for name in LLVM_NAMES for folder in LLVM_FOLDERS)
@@ -40,7 +39,7 @@ def choose_variant() -> tuple[str, str]:
     """The variant :func:`load_mitsuba` takes by itself, and why, in words."""
     llvm = find_llvm()
     if llvm is None:
-        return SCALAR_VARIANT, "no LLVM 15 to 20 was found (Debian: apt install libllvm19); several times slower"
+        return SCALAR_VARIANT, "no LLVM 17 to 20 was found (Debian: apt install libllvm19); several times slower"
     return LLVM_VARIANT, f"vectorised by {llvm.name}"
 
 
@@ -57,7 +56,7 @@ def load_mitsuba(variant: str | None = None) -> Any:
     if chosen not in (LLVM_VARIANT, SCALAR_VARIANT):
         raise RtgsError(f"Mitsuba variant {chosen!r} is not used here: choose {LLVM_VARIANT} or {SCALAR_VARIANT}")
     if chosen == LLVM_VARIANT and (llvm is None or not llvm.exists()):
-        found = f"DRJIT_LIBLLVM_PATH={llvm} does not exist" if llvm else "no LLVM 15 to 20 was found"
+        found = f"DRJIT_LIBLLVM_PATH={llvm} does not exist" if llvm else "no LLVM 17 to 20 was found"
         raise RtgsError(f"{found}: install one (Debian: apt install libllvm19), or take the variant {SCALAR_VARIANT}")
     try:
         import mitsuba
