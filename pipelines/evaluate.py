@@ -116,6 +116,7 @@ STEP = StepKind(
         "rtgs.evaluate.layers",
         "rtgs.evaluate.surface",
         "rtgs.mesh.container",
+        "rtgs.mesh.normals",
         "rtgs.evaluate.metrics",
         "rtgs.evaluate.lpips",
         "rtgs.evaluate.images",

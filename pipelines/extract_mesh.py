@@ -290,6 +290,7 @@ STEP = StepKind(
         "rtgs.mesh.grid",
         "rtgs.mesh.guide",
         "rtgs.mesh.hull",
+        "rtgs.mesh.normals",
         "rtgs.mesh.outlines",
         "rtgs.mesh.pane",
         "rtgs.mesh.settings",

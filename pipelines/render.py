@@ -97,6 +97,7 @@ STEP = StepKind(
         "rtgs.methods.glass_evidence",
         "rtgs.methods.glass_stage",
         "rtgs.mesh.container",
+        "rtgs.mesh.normals",
         "rtgs.methods.mirror",
         "rtgs.methods.traced_pixels",
         "rtgs.gaussians.materials",

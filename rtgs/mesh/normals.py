@@ -4,7 +4,7 @@ degrees even where its vertices are right."""
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from rtgs.mesh.triangles import TriangleMesh
 
@@ -52,9 +52,9 @@ def neighbourhood_normals(
     apart = (own[mesh.faces] * corners).sum(-1) < np.cos(np.radians(CREASE_DEGREES / 2))
     sharp = np.bincount(flat, weights=apart.reshape(-1), minlength=count) > 0
     share = np.where(sharp, 0, np.bincount(flat, weights=area, minlength=count))
-    tree, found = cKDTree(mesh.vertices), np.zeros_like(own)
+    tree, found = KDTree(mesh.vertices), np.zeros_like(own)
     for start in range(0, count, _CHUNK):
-        part = cKDTree(mesh.vertices[start : start + _CHUNK])
+        part = KDTree(mesh.vertices[start : start + _CHUNK])
         pairs = part.sparse_distance_matrix(tree, reach, output_type="ndarray")
         row, other = pairs["i"] + start, pairs["j"]
         alike = (own[row] * own[other]).sum(1)
