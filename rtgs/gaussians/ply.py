@@ -168,7 +168,7 @@ def _gaussians_of(path: Path, vertices: plyfile.PlyElement, names: list[str]) ->
 def _read_compressed(path: Path) -> Ellipsoids:
     """PlayCanvas' packed layout, unpacked by ``gsply``."""
     try:
-        import gsply
+        import gsply  # pyright: ignore[reportMissingImports]  (an extra)
     except ImportError as error:
         raise RtgsError(
             f"{path} is a compressed splat: `pip install 'rtgs[compressed]'` (the package gsply) reads it, or "

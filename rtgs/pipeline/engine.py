@@ -223,7 +223,7 @@ def _cluster(settings: EngineSettings) -> Any:
 
 def _slurm(settings: EngineSettings, threads: int) -> Any:
     try:
-        from dask_jobqueue.slurm import SLURMCluster
+        from dask_jobqueue.slurm import SLURMCluster  # pyright: ignore[reportMissingImports]  (an extra)
     except ImportError as error:
         raise RtgsError("kind=slurm needs dask-jobqueue: pip install 'rtgs[cluster]'") from error
     cluster = SLURMCluster(
