@@ -57,12 +57,10 @@ def object_params(config: RunConfig) -> ExtractMeshParams:
     mesh = config.mesh
     chosen = mesh.object
     if mesh.source == "given":
-        file = Path(chosen.given)
-        if not chosen.given or not file.is_file():
-            raise RtgsError(f"mesh.source=given needs mesh.object.given, a PLY or OBJ file; {chosen.given!r} is none")
         from rtgs.mesh.choose import read_given
 
-        read_given(chosen.given)  # refuses a broken one before two stages are trained
+        read_given(chosen.given)  # refuses what is none before two stages are trained
+        file = Path(chosen.given)
         digest = hashlib.sha256(file.read_bytes()).hexdigest()
         chosen = replace(chosen, given=str(file.resolve()), given_sha256=digest)
     return ExtractMeshParams(mesh.tsdf, mesh.of == "object", mesh.depth_ratio, mesh.obj, mesh.source, chosen)

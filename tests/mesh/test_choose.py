@@ -98,6 +98,9 @@ def test_auto_takes_no_tsdf_mesh_that_the_masks_contradict() -> None:
     assert "mesh.object.tsdf_accept 0.5" in why
     assert chosen("auto", few, replace(SETTINGS, tsdf_accept=0.05), lump).mesh.source == "tsdf"
     assert chosen("tsdf", few, fuse=lump).mesh.source == "tsdf"  # asked for: made
+    fair = chosen("auto", few, fuse=lambda box: (sphere(0.7, 24), 0.02))
+    assert 0.5 < fair.candidates["tsdf"] < fair.candidates["hull"]
+    assert fair.mesh.source == "tsdf", "few masks agree with any hull"
     one = mask_set(ring(8), [few.views[0].mask, *[None] * 7])
     with pytest.raises(RtgsError, match="no mesh of the transparent object can be made") as caught:
         chosen("auto", one, fuse=lump)
