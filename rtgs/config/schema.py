@@ -10,7 +10,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from rtgs.mesh.settings import FLAT, SOURCES, ObjectSettings, TsdfSettings
+from rtgs.mesh.settings import SOURCES, ObjectSettings, TsdfSettings
 from rtgs.prepare.masks_settings import MaskSettings
 from rtgs.prepare.settings import NormalSettings, SfmSettings
 from rtgs.scenes.settings import SceneSettings
@@ -101,8 +101,7 @@ class MeshConfig:
     tsdf: TsdfSettings = field(default_factory=TsdfSettings)
 
     def __post_init__(self) -> None:
-        choices = {"source": (self.source, SOURCES), "of": (self.of, MESH_OF), "object.flat": (self.object.flat, FLAT)}
-        for key, (value, allowed) in choices.items():
+        for key, (value, allowed) in {"source": (self.source, SOURCES), "of": (self.of, MESH_OF)}.items():
             refuse_unless(value in allowed, f"mesh.{key}", value, " or ".join(allowed))
 
 

@@ -13,7 +13,7 @@ from rtgs.errors import RtgsError
 from rtgs.mesh.container import ObjectMesh
 from rtgs.mesh.hull import HullResult, carve_hull
 from rtgs.mesh.pane import drawn_pane, fit_pane, is_flat
-from rtgs.mesh.settings import FLAT, SOURCES, ObjectSettings
+from rtgs.mesh.settings import SOURCES, ObjectSettings
 from rtgs.mesh.silhouettes import MaskSet, SilhouetteScore, direction_spread, silhouette_score
 from rtgs.mesh.smoothing import volume
 from rtgs.mesh.triangles import TriangleMesh, read_mesh_obj, read_mesh_ply
@@ -140,11 +140,8 @@ def choose_object_mesh(
     Raises:
         RtgsError: an unknown name, or no mesh can be made; with what was tried.
     """
-    if source not in SOURCES or settings.flat not in FLAT:
-        raise RtgsError(
-            f"mesh.source is {source!r} (one of {', '.join(SOURCES)}), mesh.object.flat is {settings.flat!r} (one of "
-            f"{', '.join(FLAT)})"
-        )
+    if source not in SOURCES:
+        raise RtgsError(f"mesh.source is {source!r}: one of {', '.join(SOURCES)}")
     tried = _Candidates(masks, settings, fuse, panes)
     make = {"hull": _hull_or_pane, "auto": _automatic}.get(source, lambda found: getattr(found, _MADE[source])())
     try:

@@ -185,8 +185,10 @@ class _Evidence:
 
     def seen(self, needed: int) -> np.ndarray:
         """(X, Y, Z) bool: free in so many views."""
+        from scipy.ndimage import uniform_filter
+
         seen = self.inside & (self.free >= needed)
-        return seen & (_share_nearby(seen) > 0.13)  # lone voxels are noise
+        return seen & (uniform_filter(seen.astype(np.float32), 3, mode="constant") > 0.13)  # lone voxels are noise
 
     def trimmed(self, values: np.ndarray, needed: int) -> tuple[np.ndarray, float]:
         """The field without what lies outside the convex hull of what is free in so many views; share removed.
@@ -220,13 +222,6 @@ def _evidence(values: np.ndarray, grid: Grid, views: Sequence[MaskView], setting
     if evidence.seen(settings.trim_views).sum() < 0.1 * inside.sum():
         return "the base set's depth lies in front of nearly all of the hull"
     return evidence
-
-
-def _share_nearby(seen: np.ndarray) -> np.ndarray:
-    """(X, Y, Z) share of the 27 voxels around each that are seen."""
-    from scipy.ndimage import uniform_filter
-
-    return uniform_filter(seen.astype(np.float32), 3, mode="constant")
 
 
 def _in_front(view: MaskView, points: Tensor, margin: float) -> np.ndarray:

@@ -106,6 +106,7 @@ class ObjectSettings:
 
     def __post_init__(self) -> None:
         refuse_bad_numbers(self, "mesh.object")
+        refuse_unless(self.flat in FLAT, "mesh.object.flat", self.flat, " or ".join(FLAT))
         for name in ("accept", "tsdf_accept"):
             value = getattr(self, name)
             refuse_unless(value <= 1, f"mesh.object.{name}", value, "between 0 and 1")
