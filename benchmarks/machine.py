@@ -5,11 +5,15 @@ from __future__ import annotations
 import os
 import platform
 import resource
+import time
 from pathlib import Path
 
 import torch
 
 from rtgs.native import core
+
+_THREAD_CPU_CLOCK = 0b110
+"""Of clock_getcpuclockid(3): a single thread, by the scheduler's count."""
 
 
 def machine() -> dict[str, str | int]:
@@ -24,12 +28,17 @@ def machine() -> dict[str, str | int]:
 
 
 def thread_cpu_seconds() -> dict[int, float]:
-    """CPU seconds of each thread of this process since its start (Linux; elsewhere an empty dict)."""
+    """CPU seconds of each thread of this process since its start (Linux; elsewhere an empty dict).
+
+    From the kernel's CPU clock of each thread, which counts up to the call; /proc's schedstat stands still between
+    two ticks of the scheduler, and short work would have taken no time.
+    """
     seconds = {}
-    for task in Path("/proc/self/task").glob("*/schedstat"):
+    for task in Path("/proc/self/task").glob("*"):
+        thread = int(task.name)
         try:
-            seconds[int(task.parent.name)] = int(task.read_text().split()[0]) * 1e-9
-        except (OSError, IndexError):  # the thread has just ended
+            seconds[thread] = time.clock_gettime((~thread << 3) | _THREAD_CPU_CLOCK)
+        except OSError:  # the thread has just ended
             continue
     return seconds
 

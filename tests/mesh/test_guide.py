@@ -134,6 +134,16 @@ def test_small_and_distant_scenes_keep_relative_precision() -> None:
         assert pair.far.item() == pytest.approx(31 * scale, rel=1e-6)
 
 
+def test_a_far_camera_hits_a_small_mesh_where_its_planes_are() -> None:
+    """Float32 distances of a camera 100,000 sizes away are off by a hundredth; the planes' are not."""
+    guide = MeshGuide(box((-1.0123,) * 3, (1.0123,) * 3), 1e-4)
+    across = np.linspace(-0.7, 0.7, 9)
+    origins = np.stack([across, np.full(9, -1e5), across[::-1]], axis=1)
+    hits = guide.intersect(origins, np.tile([0.0, 1.0, 0.0], (9, 1)))
+    assert (hits.count == 2).all()
+    np.testing.assert_allclose(hits.distance[:, :2], [[1e5 - 1.0123, 1e5 + 1.0123]] * 9, rtol=0, atol=1e-6)
+
+
 def test_bad_calls() -> None:
     mesh = box(LOW, HIGH)
     with pytest.raises(ValueError, match="no triangles"):

@@ -78,6 +78,24 @@ def test_the_set_behind_glass_can_learn_faster_than_the_base(made: GlassScene):
     assert {name for name in behind if behind[name] == 3 * base[name]} == {"sh_dc", "sh_rest", "log_scales"}
 
 
+@pytest.mark.parametrize(("split", "turned"), [(True, (True, True)), (False, (False, True))])
+def test_a_set_from_the_base_keeps_its_degrees_and_a_random_one_earns_them(
+    made: GlassScene, split: bool, turned: tuple[bool, bool]
+):
+    """Direction counts at the stage's first step only in colours that the base set has already learned."""
+    method = begun(glass_recipe(split=split, sh_every=10, second_bounce="none"), made)
+    assert method.transmittance is not None
+    camera, own = made.scene.test[0].camera, method.transmittance.surfels
+    found = []
+    with torch.no_grad():
+        for step in (30, 40):  # the set's clock begins at 30
+            own.sh_rest.zero_()
+            before = method.render(camera, step).image
+            own.sh_rest[:, :3] = 1.0
+            found.append(not torch.equal(before, method.render(camera, step).image))
+    assert tuple(found) == turned
+
+
 def test_glass_may_have_a_bound_of_its_own(made: GlassScene):
     """``transmittance.max_gain`` changes the reflection in the object's pixels and nowhere else."""
     recipe = glass_recipe()
