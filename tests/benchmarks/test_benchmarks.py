@@ -7,6 +7,7 @@ import io
 import json
 import math
 import sys
+import threading
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -34,6 +35,7 @@ from benchmarks import (
     training_runs,
     transmittance_step,
 )
+from benchmarks.machine import thread_cpu_seconds
 from rtgs.native import core
 from tests.methods.mirror_scene import mirror_scene
 
@@ -82,6 +84,15 @@ def few_rays(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in (trace_scene, trace_levers):
         monkeypatch.setattr(module, "WIDTH", 40)
         monkeypatch.setattr(module, "HEIGHT", 28)
+
+
+def test_cpu_time_of_a_thread_counts_up_to_the_call() -> None:
+    """Work far shorter than a tick of the scheduler takes time, in the thread that does it."""
+    for _ in range(20):
+        before = thread_cpu_seconds()
+        sum(range(1000))
+        after = thread_cpu_seconds()
+        assert after[threading.get_native_id()] > before[threading.get_native_id()]
 
 
 @pytest.mark.usefixtures("few_rays")
