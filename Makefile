@@ -4,7 +4,7 @@ TORCH ?= torch==2.13.0
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
-NATIVE := $(wildcard rtgs/native/*.cpp rtgs/native/*.h rtgs/native/*.cmake) CMakeLists.txt pyproject.toml
+NATIVE := $(shell find rtgs/native -name "*.cpp" -o -name "*.h" -o -name "*.cmake") CMakeLists.txt pyproject.toml
 RUN ?=
 # of the tables: PRESET smoke quick standard paper; SEEDS how many; DATA stand_in ref_real nu_nerf (with DATA_ROOT); WORKERS
 PRESET ?= quick

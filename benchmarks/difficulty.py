@@ -12,10 +12,10 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-from pipelines import cli
-from pipelines.evaluate import TABLE_JSON
+from pipelines.cli import main as cli
+from pipelines.steps.evaluate import TABLE_JSON
 from rtgs.evaluate.records import EvaluationTable, read_json
-from rtgs.scenes.embedded import embedded_capture, embedded_names
+from rtgs.scenes.importers.embedded import embedded_capture, embedded_names
 from rtgs.scenes.synthetic.record import CaptureRecord
 
 GAP = 3.0  # dB

@@ -26,7 +26,7 @@ import numpy as np
 import torch
 
 from benchmarks.machine import machine
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.mesh.settings import TsdfSettings
 from rtgs.mesh.triangles import TriangleMesh
 from rtgs.mesh.tsdf import (
@@ -184,7 +184,7 @@ def measure(name: str, ways: Sequence[str], folder: Path, long_side: int | None)
     from rtgs.mesh.container import ObjectMesh
     from rtgs.mesh.guide import MeshGuide
     from rtgs.mesh.score import container_mesh, hit_score, mesh_distance
-    from rtgs.scenes.embedded import embedded_capture
+    from rtgs.scenes.importers.embedded import embedded_capture
     from rtgs.scenes.scene import load_scene
     from rtgs.scenes.settings import SceneSettings
 

@@ -17,12 +17,12 @@ from pathlib import Path
 import torch
 
 from rtgs.gaussians.activate import activate_surfels
+from rtgs.gaussians.adam import SurfelAdam, find_nonfinite
 from rtgs.gaussians.density import DensityControl
 from rtgs.gaussians.initialize import surfels_from_points
 from rtgs.gaussians.ply import read_ply, write_ply
 from rtgs.gaussians.surfels import Surfels, activate
 from rtgs.native import core
-from rtgs.train.adam import SurfelAdam, find_nonfinite
 from rtgs.train.settings import DensitySettings, InitSettings, OptimizerSettings
 
 CENTER = torch.tensor([0.1, 0.2, 0.3])

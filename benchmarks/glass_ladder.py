@@ -184,7 +184,7 @@ def prepare(scene: str, arguments: argparse.Namespace) -> Setting:
     """Write the split and the true container of an embedded scene, world frame."""
     from rtgs.mesh.score import container_mesh
     from rtgs.mesh.triangles import write_mesh_ply
-    from rtgs.scenes.importers import read_capture
+    from rtgs.scenes.importers.registry import read_capture
     from rtgs.scenes.splits import choose_split
 
     settings = base_config(scene, arguments).scene
@@ -268,7 +268,7 @@ def _summary(folder: Path) -> dict[str, Any]:
 
 def bright_psnr(places: dict[str, Path]) -> float:
     """Mean PSNR over the bright pixels of the views with truth."""
-    from pipelines.views import read_render
+    from pipelines.steps.views import read_render
     from rtgs.evaluate.metrics import psnr
     from rtgs.scenes.canonical import read_scene
 

@@ -31,7 +31,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from benchmarks.machine import machine
-from rtgs.pipeline import Store
+from rtgs.workflow import Store
 
 SWEEP = ("scene=matte_room", "method=2dgs,3dgs", "seed=0,1", "preset=smoke", "schedule.checkpoint_every=20")
 ENGINE = ("hydra/launcher=rtgs_dask", "hydra.launcher.workers=2", "hydra.launcher.threads=1")

@@ -18,10 +18,10 @@ from types import ModuleType
 import torch
 from torch import Tensor
 
-from rtgs.cameras import Camera
-from rtgs.evaluate.lpips import Lpips
-from rtgs.evaluate.vgg import BLOCKS, VGG16_WIDTHS, Vgg16Features
+from rtgs.core.cameras import Camera
 from rtgs.native import core
+from rtgs.pretrained.lpips import Lpips
+from rtgs.pretrained.vgg import BLOCKS, VGG16_WIDTHS, Vgg16Features
 from rtgs.train import losses, reference_losses
 from rtgs.train.perceptual import PerceptualLoss
 from rtgs.train.settings import LossSettings

@@ -25,12 +25,12 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.machine import machine, peak_memory_mb
-from rtgs.prepare.masks import MaskRequest, make_masks, mask_path, write_mask
-from rtgs.prepare.masks_hull import in_form
-from rtgs.prepare.masks_report import MaskReport
-from rtgs.prepare.masks_settings import CleanSettings, DrawnSettings, GivenSettings, MaskSettings
+from rtgs.prepare.masks.hull import in_form
+from rtgs.prepare.masks.make import MaskRequest, make_masks, mask_path, write_mask
+from rtgs.prepare.masks.report import MaskReport
+from rtgs.prepare.masks.settings import CleanSettings, DrawnSettings, GivenSettings, MaskSettings
 from rtgs.scenes.images import nearest_resize, read_mask
-from rtgs.scenes.importers import read_capture
+from rtgs.scenes.importers.registry import read_capture
 from rtgs.scenes.settings import SceneSettings
 
 SCENES = ("ball_statue", "popcorn_cup", "real_bottle", "tall_bottle")
@@ -164,8 +164,8 @@ def clock_door() -> dict[str, float]:
     """Pixels between drawn and carried corners in photos that a fit did not see: from every two of four, from one."""
     import itertools
 
-    from rtgs.prepare.masks_drawn import read_drawing
-    from rtgs.prepare.masks_plane import fit_pane
+    from rtgs.prepare.masks.drawn import read_drawing
+    from rtgs.prepare.masks.plane import fit_pane
     from rtgs.scenes.undistort import project
 
     shared = Path(os.environ.get("RTGS_SHARED", "../shared"))
@@ -204,9 +204,9 @@ class NetworkTimes:
 
 def time_network(part: str, folder: Path, photos: int) -> NetworkTimes:
     """The detector for one phrase, or the segmenter for one box."""
-    from rtgs.prepare.masks_detect import Box, Detector, PromptTokenizer
-    from rtgs.prepare.masks_segment import Segmenter
-    from rtgs.prepare.masks_settings import DetectorSettings, SegmenterSettings
+    from rtgs.prepare.masks.detect import Box, Detector, PromptTokenizer
+    from rtgs.prepare.masks.segment import Segmenter
+    from rtgs.prepare.masks.settings import DetectorSettings, SegmenterSettings
     from rtgs.prepare.onnx import Network
 
     before, began = peak_memory_mb(), time.process_time()
@@ -245,7 +245,7 @@ def make_networks(folder: Path, part: str) -> None:
     import transformers
     from tokenizers import Tokenizer, models, pre_tokenizers, processors
 
-    from rtgs.prepare.masks_export import export_grounding_dino, export_sam2
+    from rtgs.prepare.masks.onnx_export import export_grounding_dino, export_sam2
 
     if part == "segmenter":
         model = transformers.Sam2Model(transformers.Sam2Config())

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.mesh.container import ObjectMesh
 from rtgs.mesh.guide import MeshGuide
 from rtgs.mesh.hull import carve_hull
@@ -24,7 +24,7 @@ from rtgs.mesh.settings import HullSettings, TsdfSettings
 from rtgs.mesh.silhouettes import mask_set, silhouette_score
 from rtgs.mesh.triangles import TriangleMesh
 from rtgs.mesh.tsdf import DepthView, fuse_depths, import_open3d, object_fusion
-from rtgs.scenes.embedded import embedded_capture, embedded_names
+from rtgs.scenes.importers.embedded import embedded_capture, embedded_names
 from rtgs.scenes.scene import Scene, load_scene
 from rtgs.scenes.settings import SceneSettings
 from rtgs.scenes.synthetic.description import TRANSPARENT, named_scene

@@ -226,10 +226,10 @@ def another_recipe(folder: Path, words: Sequence[str]) -> str:
     having been given; empty where it is the same. Keys that came later have their defaults."""
     import yaml
 
-    from rtgs.config.build import build
     from rtgs.config.compose import compose
-    from rtgs.errors import RtgsError
-    from rtgs.pipeline.fingerprint import flatten, recipe_params
+    from rtgs.core.build import build
+    from rtgs.core.errors import RtgsError
+    from rtgs.workflow.fingerprint import flatten, recipe_params
 
     config = compose(list(words))[0]
     kept = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))

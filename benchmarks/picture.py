@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.evaluate import TABLE_JSON
-from pipelines.results import RUN_FILE, RunRecord
-from pipelines.views import read_render
-from rtgs.errors import RtgsError
+from pipelines.publishing.results import RUN_FILE, RunRecord
+from pipelines.steps.evaluate import TABLE_JSON
+from pipelines.steps.views import read_render
+from rtgs.core.errors import RtgsError
 from rtgs.evaluate.images import ERROR_FULL_SCALE, error_map, to_bytes
 from rtgs.evaluate.records import EvaluationTable, read_json
 from rtgs.report.figures import depth_picture, normal_picture

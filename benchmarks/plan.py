@@ -22,10 +22,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from benchmarks.machine import machine
-from pipelines.planning import Job, MergedJobs, merge_jobs, merged_table
+from pipelines.planning.plan import Job, MergedJobs, merge_jobs, merged_table
 from rtgs.config.sweep import compose_jobs
-from rtgs.pipeline import Plan, Step, Store, make_plan, topological
-from rtgs.pipeline.manifest import FileRecord, Manifest
+from rtgs.workflow import Plan, Step, Store, make_plan, topological
+from rtgs.workflow.manifest import FileRecord, Manifest
 
 SCENES = "sedan,spheres,toycar,ball_statue,matte_room"
 METHODS = "2dgs,3dgs,envgs,rtgs"

@@ -20,9 +20,9 @@ from torch.nn.functional import avg_pool2d, interpolate
 
 from benchmarks.trace_levers import Answer, LeverPoint, compared
 from benchmarks.yardstick_scene import HEIGHT, SCALES, WIDTH, made_arrays
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.render.buffers import RasterOptions
-from rtgs.render.rasterize import rasterize_surfels
+from rtgs.render.surfels import rasterize_surfels
 
 CHANNELS = 12
 DEFAULTS = RasterOptions(depth=True, normal=True)  # what a training step asks for

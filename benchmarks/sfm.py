@@ -52,10 +52,10 @@ def measure(capture: Path, photos: int | None, threads: int) -> Row:
     """Find poses for the photos of ``capture`` and compare them with its own."""
     import numpy as np
 
-    from rtgs.prepare.compare import compare_poses
-    from rtgs.prepare.poses import Request, find_poses
+    from rtgs.prepare.poses.compare import compare_poses
+    from rtgs.prepare.poses.find import Request, find_poses
     from rtgs.prepare.settings import SfmSettings
-    from rtgs.scenes.importers import read_capture
+    from rtgs.scenes.importers.registry import read_capture
     from rtgs.scenes.settings import SceneSettings
 
     given = read_capture(SceneSettings(path=str(capture)))

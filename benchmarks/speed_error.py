@@ -43,12 +43,12 @@ from benchmarks.trace_levers_plot import draw_levers, draw_raster_levers
 from benchmarks.trace_training import SETTINGS, end_to_end_points
 from benchmarks.training_runs import schedule_overrides, train_run
 from benchmarks.yardstick_scene import HEIGHT, SCALES, WIDTH, made_arrays
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.native import core
-from rtgs.render import reference
 from rtgs.render.buffers import RasterBuffers, RasterOptions
-from rtgs.render.discontinuities import discontinuity_mask
-from rtgs.render.rasterize import rasterize_surfels
+from rtgs.render.discontinuities.surfels import discontinuity_mask
+from rtgs.render.reference import surfels as reference
+from rtgs.render.surfels import rasterize_surfels
 
 RESULTS = Path(__file__).parent / "results"
 NAME = "speed_error"

@@ -25,11 +25,11 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.machine import machine
-from pipelines.cli import main as rtgs
-from pipelines.pictures import TrainingPictures
-from rtgs.pipeline import Store
+from pipelines.cli.main import main as rtgs
+from pipelines.steps.pictures import TrainingPictures
 from rtgs.track.mlflow import MlflowTracker, MlflowTracking
 from rtgs.train.trainer import Trainer
+from rtgs.workflow import Store
 
 WORDS = ("scene=sedan", "method=2dgs", "preset=quick", "threads=1")
 

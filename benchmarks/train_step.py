@@ -21,14 +21,14 @@ import torch
 from torch import Tensor
 
 from benchmarks.yardstick_scene import yardstick_case
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.gaussians.surfels import ActivatedSurfels
 from rtgs.methods.base import LossTerms, RenderedView
 from rtgs.methods.gs2d import Gs2d
 from rtgs.methods.surfel_set import SurfelSet
 from rtgs.native import core
 from rtgs.render.buffers import RasterBuffers
-from rtgs.render.rasterize import rasterize_surfels
+from rtgs.render.surfels import rasterize_surfels
 from rtgs.scenes.scene import Scene, View
 from rtgs.train.guard import check_loss
 from rtgs.train.losses import normal_consistency_loss, photometric_loss

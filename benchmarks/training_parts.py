@@ -120,15 +120,16 @@ class PartClock:
 def clocks(clock: PartClock) -> Iterator[None]:
     """Every part of a step under its clock."""
     from rtgs.gaussians import activate
+    from rtgs.gaussians.adam import SurfelAdam
     from rtgs.gaussians.density import DensityControl
     from rtgs.methods.reflective import ReflectiveMethod
     from rtgs.methods.surfel_base import SurfelMethod
     from rtgs.methods.surfel_set import SurfelSet
     from rtgs.methods.traced_set import FollowingTree
     from rtgs.methods.transmittance import TransmissiveMethod
-    from rtgs.render import ellipsoids, rasterize, trace
+    from rtgs.render import ellipsoids, trace
+    from rtgs.render import surfels as rasterize
     from rtgs.train import losses
-    from rtgs.train.adam import SurfelAdam
 
     functions = [
         (rasterize._Rasterize, "raster"),
@@ -183,7 +184,7 @@ def stage_shares(
 
 def found_mesh(method: Method, step: int, scene: Scene, config: RunConfig) -> ObjectMesh:
     """The transparent object's mesh, as the step ``extract_mesh`` of a run finds it."""
-    from pipelines.extract_mesh import find_object_mesh, object_params
+    from pipelines.steps.extract_mesh import find_object_mesh, object_params
 
     return find_object_mesh(method, step, scene, object_params(config))[0].mesh
 

@@ -18,7 +18,7 @@ case "${1:-}" in
     need RTGS_SCHEDULER "the address of the scheduler, tcp://host:8786"
     threads="${RTGS_THREADS:-1}"
     export OMP_NUM_THREADS="$threads" MKL_NUM_THREADS="$threads" OPENBLAS_NUM_THREADS="$threads" OMP_WAIT_POLICY=passive
-    export MALLOC_TRIM_THRESHOLD_=268435456 MALLOC_MMAP_THRESHOLD_=33554432 # as rtgs/pipeline/engine.py: worker_environment
+    export MALLOC_TRIM_THRESHOLD_=268435456 MALLOC_MMAP_THRESHOLD_=33554432 # as rtgs/workflow/engine.py: worker_environment
     # one step at a time: the threads are those of the core and of torch
     exec dask worker "$RTGS_SCHEDULER" --nworkers 1 --nthreads 1 --memory-limit "${RTGS_MEMORY:-auto}" --local-directory /tmp
     ;;

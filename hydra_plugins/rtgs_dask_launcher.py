@@ -1,7 +1,7 @@
 """Hydra's ``hydra/launcher=rtgs_dask``: all jobs of a sweep as one merged plan on Dask workers.
 
 Hydra takes launchers from the namespace package ``hydra_plugins`` only; everything of substance is in
-``pipelines.sweep`` and ``rtgs.pipeline.engine``.
+``pipelines.planning.sweep`` and ``rtgs.workflow.engine``.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, open_dict
 
-from pipelines.planning import Job
-from pipelines.sweep import prepared, run_merged
+from pipelines.planning.plan import Job
+from pipelines.planning.sweep import prepared, run_merged
 from rtgs.config.compose import choices_from, without_hydra
 from rtgs.config.convert import to_run_config
 from rtgs.config.schema import open_schema
-from rtgs.pipeline.engine import EngineSettings
+from rtgs.workflow.engine import EngineSettings
 
 log = logging.getLogger("rtgs")
 NAME = "rtgs_dask"

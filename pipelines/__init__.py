@@ -1,4 +1,5 @@
-"""The steps from photos to a report, one file each.
+"""From photos to a report.
 
-:mod:`pipelines.graph` joins them, :mod:`pipelines.app` runs them, :mod:`pipelines.cli` is the command line.
+``steps`` holds the steps, one file each; ``planning`` joins them to graphs; ``publishing`` shows what they gave;
+``cli`` is the command line.
 """

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 
 
 def camera(**changes: float) -> Camera:

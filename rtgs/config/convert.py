@@ -10,9 +10,9 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from rtgs.config.build import build
 from rtgs.config.schema import Choices, RunConfig
-from rtgs.errors import RtgsError
+from rtgs.core.build import build
+from rtgs.core.errors import RtgsError
 
 _UNTELLING = {"images", "input", "rgb", "sparse", "colmap", "0", "data", "dense", "undistorted"}
 

@@ -6,7 +6,7 @@ from functools import cache
 from pathlib import Path
 
 import rtgs
-from rtgs.errors import RtgsError
+from rtgs.core.errors import RtgsError
 
 
 @cache

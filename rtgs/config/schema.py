@@ -10,11 +10,11 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from rtgs.core.refuse import refuse_unless
 from rtgs.mesh.settings import SOURCES, ObjectSettings, TsdfSettings
-from rtgs.prepare.masks_settings import MaskSettings
+from rtgs.prepare.masks.settings import MaskSettings
 from rtgs.prepare.settings import NormalSettings, SfmSettings
 from rtgs.scenes.settings import SceneSettings
-from rtgs.train.refuse import refuse_unless
 from rtgs.train.settings import MethodSettings, ScheduleSettings
 
 SCHEMA_NAME = "run_schema"
@@ -82,7 +82,7 @@ class EvaluationConfig:
 
 @dataclass(frozen=True)
 class MeshConfig:
-    """The mesh step (methods.md 6.3)."""
+    """The mesh step (method.md 6.3)."""
 
     extract: bool = False
     """Run it: fuse the depths of the training views into a mesh."""
@@ -95,7 +95,7 @@ class MeshConfig:
     source: str = "auto"
     """Of the transparent object's mesh, for the third stage: ``hull``, ``tsdf``, ``given`` or ``auto``."""
     of: str = "object"
-    """What the third stage's TSDF mesh is of: the masked ``object``, or the ``scene`` (register row 15)."""
+    """What the third stage's TSDF mesh is of: the masked ``object``, or the ``scene`` (decision 15)."""
     object: ObjectSettings = field(default_factory=ObjectSettings)
     """How that mesh is found."""
     tsdf: TsdfSettings = field(default_factory=TsdfSettings)

@@ -13,7 +13,7 @@ from rtgs.config.compose import VERSION_BASE, choices_from, without_hydra
 from rtgs.config.convert import to_run_config
 from rtgs.config.locate import conf_dir
 from rtgs.config.schema import Choices, RunConfig, register_schema
-from rtgs.errors import RtgsError
+from rtgs.core.errors import RtgsError
 
 if TYPE_CHECKING:
     from hydra._internal.config_loader_impl import ConfigLoaderImpl

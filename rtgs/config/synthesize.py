@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 
-from rtgs.config.build import build
 from rtgs.config.compose import VERSION_BASE, without_hydra
 from rtgs.config.locate import conf_dir
 from rtgs.config.schema import PathsConfig, open_schema
+from rtgs.core.build import build
 from rtgs.scenes.synthetic.settings import CaptureSettings
 
 SCHEMA_NAME = "synthesize_schema"

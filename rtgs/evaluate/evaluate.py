@@ -11,7 +11,6 @@ from torch import Tensor
 
 from rtgs.evaluate.images import ERROR_FULL_SCALE, error_map, error_scale_note, file_stem, write_png
 from rtgs.evaluate.layers import LayerTruth, layer_scales, layer_scores, why_absent
-from rtgs.evaluate.lpips import InputRange, Lpips, lpips
 from rtgs.evaluate.metrics import psnr, quantized, ssim
 from rtgs.evaluate.records import (
     GIVEN_MASK_METRICS,
@@ -24,7 +23,8 @@ from rtgs.evaluate.records import (
     ViewScore,
 )
 from rtgs.evaluate.surface import surface_scores
-from rtgs.evaluate.weights import MissingWeights, WrongWeights
+from rtgs.pretrained.lpips import InputRange, Lpips, lpips
+from rtgs.pretrained.weights import MissingWeights, WrongWeights
 
 NO_TEST_VIEWS = "the scene has no test views; scene.split_every=8 holds out every 8th"
 

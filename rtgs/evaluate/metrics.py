@@ -1,4 +1,4 @@
-"""Image metrics on [0, 1] RGB, as the papers of the field compute them (methods.md section 9).
+"""Image metrics on [0, 1] RGB, as the papers of the field compute them (method.md 9).
 
 Every function takes a rendered ``image`` and a ``target`` of shape (3, H, W), floating point. The target must lie in
 [0, 1]; the render is clamped to it. Nothing is guessed: integer tensors, other layouts, other ranges and non-finite

@@ -16,7 +16,7 @@ LAYER_METRICS = (
     *(f"psnr_{layer}{scaled}" for layer in ("reflection", "transmission") for scaled in ("", "_scaled")),
 )
 SURFACE_METRICS = ("depth_error_masked", "depth_share_masked", "normal_degrees_masked", "normal_share_masked")
-# Seen through the test views' own masks instead of the mesh's silhouette (methods.md 7; register row 21).
+# Seen through the test views' own masks instead of the mesh's silhouette (method.md 7; decision 21).
 GIVEN_MASK_METRICS = ("psnr_given_masks", "psnr_masked_given_masks", "ssim_masked_given_masks")
 # In the order of the columns. Higher is better for psnr*, ssim*, *_share*; lower for lpips*, *_error*, *_degrees*.
 METRICS = (
@@ -42,7 +42,7 @@ METRICS = (
 class ObjectFacts:
     """The mesh of the transparent object; None: not known. Shares are of the pixels in the masks that bound something.
 
-    The fallbacks of methods.md 6.3: where the mesh has one surface, the object is a thin sheet, seen through without a
+    The fallbacks of method.md 6.3: where the mesh has one surface, the object is a thin sheet, seen through without a
     depth between its walls; where the ray misses it, a training pixel likewise, and a test pixel shows no transmission.
     """
 

@@ -28,7 +28,7 @@ def _scores(method: str, scenes: Sequence[str], cells: str) -> dict[tuple[str, s
 _REF_REAL = ("sedan", "gardenspheres", "toycar")
 _NU_NERF = ("ballstatue", "popcorncup", "real_bottle", "tall_bottle")
 
-# methods.md section 11, keys (method, scene) in this project's names.
+# method.md 11, keys (method, scene) in this project's names.
 PAPER_SCORES: dict[tuple[str, str], PaperScore] = {
     **_scores("3dgs", _REF_REAL, "25.556 0.729 0.294 22.386 0.590 0.239 24.394 0.661 0.229"),
     **_scores("gaussian_shader", _REF_REAL, "22.759 0.648 0.395 22.080 0.599 0.268 23.641 0.661 0.283"),

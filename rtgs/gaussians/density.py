@@ -1,6 +1,6 @@
 """Density control: where surfels are cloned, split and pruned, and how a change of N reaches everything that has rows.
 
-The rules are those of 3DGS, 2DGS and EnvGS (methods.md 6.1, 12), their differences are settings; ellipsoids meet the
+The rules are those of 3DGS, 2DGS and EnvGS (method.md 6.1, 12), their differences are settings; ellipsoids meet the
 same ones as surfels. Each surfel meets at most one of them in a call, in this order: transparent -> pruned; too large
 -> pruned or split into 5; high signal and large -> split into 2; high signal and small -> cloned. The cap on N comes
 last.
@@ -15,8 +15,8 @@ from typing import Protocol, TypeVar
 import torch
 from torch import Tensor
 
+from rtgs.gaussians.adam import SurfelAdam
 from rtgs.gaussians.primitives import Gaussians
-from rtgs.train.adam import SurfelAdam
 from rtgs.train.settings import DensitySettings
 
 Kind = TypeVar("Kind", bound=Gaussians)

@@ -36,7 +36,7 @@ def rest_count(degree: int) -> int:
 
 
 def rgb_to_sh_dc(rgb: Tensor) -> Tensor:
-    """(N, 3) colours in 0..1 to the degree-0 coefficients that show them (methods.md section 2)."""
+    """(N, 3) colours in 0..1 to the degree-0 coefficients that show them (method.md 2)."""
     return (rgb - 0.5) / SH_C0
 
 

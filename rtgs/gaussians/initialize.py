@@ -1,4 +1,4 @@
-"""Initial surfels and ellipsoids: from a point cloud, or from random points in a box (methods.md section 2)."""
+"""Initial surfels and ellipsoids: from a point cloud, or from random points in a box (method.md 2)."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import torch
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from rtgs.errors import RtgsError
+from rtgs.core.errors import RtgsError
 from rtgs.gaussians.harmonics import rest_count, rgb_to_sh_dc
 from rtgs.gaussians.primitives import Gaussians
 from rtgs.gaussians.surfels import Surfels
 from rtgs.train.settings import InitSettings
 
 SMALLEST_SQUARED_DISTANCE = 1e-7  # world units squared: the scale of duplicate points
-BOX_QUANTILES = (0.005, 0.995)  # per axis: the scene box without far outliers (methods.md 6.1)
+BOX_QUANTILES = (0.005, 0.995)  # per axis: the scene box without far outliers (method.md 6.1)
 Kind = TypeVar("Kind", bound=Gaussians)
 
 

@@ -1,4 +1,4 @@
-"""Materials on surfels: what the second stage needs to know of a surface (methods.md 2, 4.2, 4.4)."""
+"""Materials on surfels: what the second stage needs to know of a surface (method.md 2, 4.2, 4.4)."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def activate_materials(surfels: MaterialSurfels, settings: MaterialSettings) -> 
 
 
 def activate_roughness(raw: Tensor, settings: MaterialSettings) -> Tensor:
-    """Roughness between its floor and 1: floor^(1 - sigmoid), or floor + (1 - floor) sigmoid (methods.md 4.2)."""
+    """Roughness between its floor and 1: floor^(1 - sigmoid), or floor + (1 - floor) sigmoid (method.md 4.2)."""
     floor, share = settings.roughness_floor, raw.sigmoid()
     if settings.roughness_curve == "linear":
         return floor + (1 - floor) * share

@@ -10,9 +10,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from rtgs.gaussians.adam import SurfelAdam
 from rtgs.gaussians.density import DensityControl, DensityReport, RowPlan, apply_plan, select_rows
 from rtgs.gaussians.primitives import Gaussians
-from rtgs.train.adam import SurfelAdam
 from rtgs.train.settings import DensitySettings
 
 MOST_OPAQUE = 1 - 1e-6  # what counts as an opacity of 1: beyond, no number of copies is equal to it

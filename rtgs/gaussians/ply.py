@@ -18,7 +18,7 @@ import plyfile
 import torch
 from torch import Tensor
 
-from rtgs.errors import RtgsError
+from rtgs.core.errors import RtgsError
 from rtgs.gaussians.ellipsoids import Ellipsoids
 from rtgs.gaussians.harmonics import rgb_to_sh_dc
 from rtgs.gaussians.materials import MaterialSurfels

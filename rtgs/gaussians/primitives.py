@@ -16,7 +16,7 @@ from torch import Tensor
 
 @dataclass
 class Gaussians:
-    """N Gaussians. Raw (unconstrained) parameters (methods.md section 2)."""
+    """N Gaussians. Raw (unconstrained) parameters (method.md 2)."""
 
     axis_count: ClassVar[int]  # S: scales a Gaussian has
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rtgs.errors import RtgsError
+from rtgs.core.errors import RtgsError
 from rtgs.mesh.container import ObjectMesh
 from rtgs.mesh.hull import HullResult, carve_hull
 from rtgs.mesh.pane import drawn_pane, fit_pane, is_flat

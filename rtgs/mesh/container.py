@@ -1,4 +1,4 @@
-"""The transparent object's surface as the transmittance stage uses it (methods.md 6.3): what is inside, where camera
+"""The transparent object's surface as the transmittance stage uses it (method.md 6.3): what is inside, where camera
 rays enter and leave it, its normals, the box its contents live in."""
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rtgs.cameras import Camera
-from rtgs.errors import RtgsError
+from rtgs.core.cameras import Camera
+from rtgs.core.errors import RtgsError
 from rtgs.mesh.guide import MeshGuide
 from rtgs.mesh.normals import corner_normals, interpolated, neighbourhood_normals
 from rtgs.mesh.triangles import TriangleMesh, read_mesh_ply, write_mesh_ply
@@ -22,8 +22,8 @@ from rtgs.mesh.triangles import TriangleMesh, read_mesh_ply, write_mesh_ply
 MESH_FILE = "mesh.ply"
 RECORD_FILE = "mesh.json"
 SOURCES = ("hull", "tsdf", "given")
-MERGE_VOXELS = 2.0  # crossings nearer than this are one wall (methods.md 6.3)
-BOX_MARGIN = 0.05  # of the object box, on each side (methods.md 6.2)
+MERGE_VOXELS = 2.0  # crossings nearer than this are one wall (method.md 6.3)
+BOX_MARGIN = 0.05  # of the object box, on each side (method.md 6.2)
 _BOX_POINTS = 0.005  # share of the points behind a pane that its box leaves out at either end of each axis
 _NORMAL_ROUNDS, _NORMAL_REACH = 2, 5.0  # of smoothing; voxels; measured in docs/mesh.md
 _BATCH = 65536  # points whose rays are cast at once

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rtgs.errors import RtgsError
+from rtgs.core.errors import RtgsError
 
 Field = Callable[[np.ndarray], np.ndarray]
 """(N, 3) world points to (N,) signed distances, positive inside; at most about as steep as a distance."""

@@ -1,4 +1,4 @@
-"""Where camera rays meet a triangle mesh: nearest and second-nearest surface (methods.md 6.3, "Second hit").
+"""Where camera rays meet a triangle mesh: nearest and second-nearest surface (method.md 6.3, "Second hit").
 
 Embree finds which triangles a ray crosses; distances are then computed in float64 from their planes.
 """
@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.mesh.triangles import TriangleMesh
 
 STEP_PAST = 1e-6  # times the coordinates' size: how far a restarted ray begins behind its last hit

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rtgs.errors import RtgsError
+from rtgs.core.errors import RtgsError
 from rtgs.mesh.grid import Grid, bounding_grid, refined, tightened
 from rtgs.mesh.outlines import MaskField, Outline, first_outlines, plain_outlines, refined_outlines
 from rtgs.mesh.settings import AUTOMATIC, HullSettings

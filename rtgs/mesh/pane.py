@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rtgs.errors import RtgsError
+from rtgs.core.errors import RtgsError
 from rtgs.mesh.outlines import HIDDEN, Outline, plain_outlines
 from rtgs.mesh.silhouettes import MaskView, focus_point
 from rtgs.mesh.triangles import TriangleMesh

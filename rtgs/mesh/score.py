@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.mesh.container import ObjectGuide, ObjectMesh
 from rtgs.mesh.triangles import TriangleMesh
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from rtgs.train.refuse import refuse_bad_numbers, refuse_unless
+from rtgs.core.refuse import refuse_bad_numbers, refuse_unless
 
 SOURCES = ("auto", "hull", "tsdf", "given")
 FLAT = ("auto", "yes", "no")
@@ -85,7 +85,7 @@ class PaneSettings:
 
 @dataclass(frozen=True)
 class ObjectSettings:
-    """The mesh of the transparent object (methods.md 6.3; docs/mesh.md)."""
+    """The mesh of the transparent object (method.md 6.3; docs/mesh.md)."""
 
     given: str = ""
     """Path of a PLY or OBJ file in the capture's world frame, for ``mesh.source=given``."""

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rtgs.cameras import Camera
-from rtgs.errors import RtgsError
+from rtgs.core.cameras import Camera
+from rtgs.core.errors import RtgsError
 from rtgs.mesh.guide import MeshGuide
 from rtgs.mesh.settings import COVERED
 from rtgs.mesh.triangles import TriangleMesh

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rtgs.errors import RtgsError
+from rtgs.core.errors import RtgsError
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Fusion of rendered depths into a triangle mesh (methods.md 6.3; the recipe of 2DGS).
+"""Fusion of rendered depths into a triangle mesh (method.md 6.3; the recipe of 2DGS).
 
 A truncated signed distance field in sparse voxel blocks (Open3D's VoxelBlockGrid), integrated view by view, then
 marching cubes and removal of small pieces.
@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rtgs.cameras import Camera
-from rtgs.errors import RtgsError
+from rtgs.core.cameras import Camera
+from rtgs.core.errors import RtgsError
 from rtgs.mesh.settings import TsdfSettings
 from rtgs.mesh.triangles import TriangleMesh
 

@@ -10,7 +10,7 @@ from rtgs.train.settings import MethodSettings, ScheduleSettings
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from rtgs.cameras import Camera
+    from rtgs.core.cameras import Camera
     from rtgs.methods.surfel_set import SurfelSet
     from rtgs.render.buffers import RasterBuffers
     from rtgs.scenes.scene import View
@@ -62,7 +62,7 @@ class SpecularLayers:
 
 @dataclass(frozen=True)
 class FirstBounce:
-    """What the first straight rays met, for the loss on their depth (methods.md 5.1); R rays that have a back surface.
+    """What the first straight rays met, for the loss on their depth (method.md 5.1); R rays that have a back surface.
 
     Depths count from the first surface, in z-depth units.
     """

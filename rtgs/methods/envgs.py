@@ -1,4 +1,4 @@
-"""EnvGS (Xie et al. 2025; methods.md 6.1, 12): base set and environment set, one mirror ray, weight 1."""
+"""EnvGS (Xie et al. 2025; method.md 6.1, 12): base set and environment set, one mirror ray, weight 1."""
 
 from __future__ import annotations
 

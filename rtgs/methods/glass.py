@@ -1,4 +1,4 @@
-"""The pixels of a view that show a transparent object, and the straight rays through them (methods.md 3.3)."""
+"""The pixels of a view that show a transparent object, and the straight rays through them (method.md 3.3)."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def glass_rays(glass: GlassPixels, index: Tensor, center: Tensor, view: Tensor) 
 
 
 def depth_loss(bounce: FirstBounce, form: str, pixels: int) -> Tensor:
-    """L_d: the first straight ray's hits lie before the second surface, summed over rays / ``pixels`` (methods.md 5.1).
+    """L_d: the first straight ray's hits lie before the second surface, summed over rays / ``pixels`` (method.md 5.1).
 
     ``form``: "accum" ReLU(Z_1 - thickness), "mean" with Z_1 / A_1 instead, "per_hit" sum of w ReLU(t - thickness).
     """

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from rtgs.cameras import Camera
-from rtgs.errors import RtgsError
+from rtgs.core.cameras import Camera
+from rtgs.core.errors import RtgsError
 from rtgs.gaussians.materials import MaterialSurfels
 from rtgs.gaussians.surfels import Surfels
 from rtgs.mesh.container import ObjectGuide, ObjectMesh

@@ -1,4 +1,4 @@
-"""2DGS (Huang et al. 2024; methods.md 12): one rasterised set of surfels, its colour in spherical harmonics."""
+"""2DGS (Huang et al. 2024; method.md 12): one rasterised set of surfels, its colour in spherical harmonics."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""3DGS (Kerbl et al. 2023; methods.md 12): one rasterised set of ellipsoids, its colour in spherical harmonics."""
+"""3DGS (Kerbl et al. 2023; method.md 12): one rasterised set of ellipsoids, its colour in spherical harmonics."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.gaussians.ellipsoids import Ellipsoids
 from rtgs.methods.base import RenderOptions
 from rtgs.methods.surfel_base import SurfelMethod

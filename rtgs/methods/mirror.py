@@ -1,4 +1,4 @@
-"""One mirror ray per pixel: from rasterised maps to rays, and from traced colours to the image (methods.md 3.3, 4).
+"""One mirror ray per pixel: from rasterised maps to rays, and from traced colours to the image (method.md 3.3, 4).
 
 In the dtype of the inputs: float32 by native kernels where that pays, any other dtype in plain torch, their twin. Every
 step is differentiable, so the reflection's loss teaches the surface its normals (through the direction), its depth
@@ -52,7 +52,7 @@ def surface_pixels(
     Args:
         features: (5 + F, P) rgb, k_s, roughness, f0, all composited.
         alpha: (P,); depth: (P,) already the surface's; normal: (3, P).
-        settings: whether roughness and f0 are divided by alpha (register row 8).
+        settings: whether roughness and f0 are divided by alpha (decision 8).
     """
     diffuse, specular, roughness, f0 = features[:3], features[3], features[4], features[5:]
     if settings.normalized:
@@ -65,7 +65,7 @@ def surface_pixels(
 def mirror_rays(pixels: SurfacePixels, center: Tensor, view: Tensor, length: str = "unit") -> MirrorRays:
     """Reflect the pixels' rays (3, P), camera-z component 1, from the camera at ``center`` (3,) world.
 
-    ``length`` of the mirror rays: "unit", or "raw": as long as the ray they come from (register row 23).
+    ``length`` of the mirror rays: "unit", or "raw": as long as the ray they come from (decision 23).
     """
     maps = (pixels.normal, pixels.depth, view, center)
     if all(m.dtype == torch.float32 and m.device.type == "cpu" for m in maps):

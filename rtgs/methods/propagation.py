@@ -1,4 +1,4 @@
-"""EnvGS's remedies for baked-in reflections: normal propagation, colour sabotage, resets (methods.md 6.1)."""
+"""EnvGS's remedies for baked-in reflections: normal propagation, colour sabotage, resets (method.md 6.1)."""
 
 from __future__ import annotations
 

@@ -88,7 +88,7 @@ def reflection_box(settings: ReflectionSettings, points: Tensor, extent: float) 
 def reflection_surfels(
     settings: ReflectionSettings, points: Tensor, extent: float, generator: torch.Generator, color: Tensor | None = None
 ) -> Surfels:
-    """The initial reflection set: stratified random surfels in its box (methods.md 6.1).
+    """The initial reflection set: stratified random surfels in its box (method.md 6.1).
 
     Each of the ``cells``^3 cells of :func:`reflection_box` gets ``per_cell`` points, all of ``color`` (3,), if it is
     given, else of random colours.

@@ -1,4 +1,4 @@
-"""Methods with a second stage: one mirror ray per pixel, traced through a set of its own (methods.md 3.3, 6.1, 6.2)."""
+"""Methods with a second stage: one mirror ray per pixel, traced through a set of its own (method.md 3.3, 6.1, 6.2)."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from rtgs.cameras import Camera
-from rtgs.evaluate.weights import MissingWeights
+from rtgs.core.cameras import Camera
 from rtgs.gaussians.materials import (
     MaterialSurfels,
     activate_materials,
@@ -43,6 +42,7 @@ from rtgs.methods.reflection_set import ReflectionSet, reflection_surfels, scene
 from rtgs.methods.surfel_base import SurfelMethod
 from rtgs.methods.traced_pixels import TracedPixels, choose_pixels
 from rtgs.optics.light import decoded, encoded
+from rtgs.pretrained.weights import MissingWeights
 from rtgs.render.buffers import RasterBuffers, TraceOptions
 from rtgs.train.losses import surface_depth
 from rtgs.train.perceptual import PerceptualLoss
@@ -342,7 +342,7 @@ class ReflectiveMethod(SurfelMethod):
     # ---- losses
 
     def losses(self, rendered: RenderedView, view: View, step: int) -> LossTerms:
-        """Those of the first stage; L_perc, and L_spec in masks of transparent objects (methods.md 5)."""
+        """Those of the first stage; L_perc, and L_spec in masks of transparent objects (method.md 5)."""
         found = super().losses(rendered, view, step)
         if rendered.specular is None:
             return found

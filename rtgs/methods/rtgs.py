@@ -1,4 +1,4 @@
-"""RT-GS: the diffuse base set, then reflection with the microfacet weight, then transmittance (methods.md 6.2)."""
+"""RT-GS: the diffuse base set, then reflection with the microfacet weight, then transmittance (method.md 6.2)."""
 
 from __future__ import annotations
 

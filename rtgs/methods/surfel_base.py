@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from rtgs.cameras import Camera
-from rtgs.errors import RtgsError
+from rtgs.core.cameras import Camera
+from rtgs.core.errors import RtgsError
 from rtgs.gaussians.initialize import gaussians_from_points
 from rtgs.gaussians.primitives import Gaussians
 from rtgs.gaussians.surfels import ActivatedSurfels, Surfels
@@ -18,7 +18,7 @@ from rtgs.methods.pixel_bound import bound_by_pixels
 from rtgs.methods.stages import method_stages
 from rtgs.methods.surfel_set import SurfelSet
 from rtgs.render.buffers import RasterBuffers, RasterOptions
-from rtgs.render.rasterize import rasterize_surfels
+from rtgs.render.surfels import rasterize_surfels
 from rtgs.train.losses import (
     distortion_loss,
     inverse_depth_weights,
@@ -56,7 +56,7 @@ def _on(start: int | None, step: int) -> bool:
 
 
 class SurfelMethod:
-    """A base set of surfels from the scene's points, rendered by rasterisation (methods.md 3.1).
+    """A base set of surfels from the scene's points, rendered by rasterisation (method.md 3.1).
 
     Subclasses add sets, shading and stages, or change the kind of Gaussian; this class alone is 2DGS.
     """
@@ -174,7 +174,7 @@ class SurfelMethod:
         )
 
     def losses(self, rendered: RenderedView, view: View, step: int) -> LossTerms:
-        """L1 and D-SSIM always; normal consistency, monocular normals, distortion as decided (methods.md 5)."""
+        """L1 and D-SSIM always; normal consistency, monocular normals, distortion as decided (method.md 5)."""
         weights = self.settings.loss
         buffers = rendered.buffers
         photometric = photometric_loss(rendered.image, view.image, weights.l1, weights.dssim)
@@ -215,7 +215,7 @@ class SurfelMethod:
         )
 
     def _mono_normal(self, buffers: RasterBuffers, view: View, camera: Camera) -> Tensor:
-        """L_mono, depth-weighted like L_norm (methods.md 5); transparent objects may count more."""
+        """L_mono, depth-weighted like L_norm (method.md 5); transparent objects may count more."""
         loss = self.settings.loss
         assert buffers.normal is not None
         assert view.normal is not None

@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from rtgs.gaussians.activate import activate_surfels
+from rtgs.gaussians.adam import SurfelAdam
 from rtgs.gaussians.density import DensityReport
 from rtgs.gaussians.mcmc import density_control
 from rtgs.gaussians.primitives import Gaussians
 from rtgs.gaussians.surfels import ActivatedSurfels
-from rtgs.train.adam import SurfelAdam
 from rtgs.train.settings import DensitySettings, OptimizerSettings
 
 
@@ -111,7 +111,7 @@ class SurfelSet:
 
     @torch.no_grad()
     def _clamp(self) -> None:
-        """Keep the activations finite whatever the learning rate (methods.md 14).
+        """Keep the activations finite whatever the learning rate (method.md 14).
 
         exp overflows float32 at 88, and a logit beyond 13.8 has a sigmoid derivative below 1e-6 from which Adam cannot
         return; the other parameters are used as they are, and Adam bounds their drift by learning rate times steps.

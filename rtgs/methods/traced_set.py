@@ -76,7 +76,7 @@ def stratified_surfels(
     generator: torch.Generator,
     color: Tensor | None = None,
 ) -> Surfels:
-    """Stratified random surfels in a box (2, 3), world (methods.md 6.1), of this ``color`` (3,) or of random ones.
+    """Stratified random surfels in a box (2, 3), world (method.md 6.1), of this ``color`` (3,) or of random ones.
 
     Each of ``cells``^3 cells gets ``per_cell`` points.
     """

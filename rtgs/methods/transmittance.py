@@ -1,4 +1,4 @@
-"""The third stage of RT-GS: straight rays through transparent objects (methods.md 3.3, 4.4, 5.1, 6.2)."""
+"""The third stage of RT-GS: straight rays through transparent objects (method.md 3.3, 4.4, 5.1, 6.2)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.gaussians.materials import MaterialSurfels
 from rtgs.gaussians.surfels import ActivatedSurfels, Surfels
 from rtgs.mesh.container import ObjectSurfaces
@@ -67,7 +67,7 @@ class TransmissiveMethod(GlassStage):
         elif options is None:
             inside = mask
         else:
-            inside = mask & surfaces.hit  # methods.md 6.3: where the ray misses the mesh nothing is transmitted
+            inside = mask & surfaces.hit  # method.md 6.3: where the ray misses the mesh nothing is transmitted
         inside = widened(inside, settings.rim if settings.interface.count > 0 else 0)
         glass = self._on_glass(surfaces)
         return glass_pixels(flat, surfaces, inside, glass, first_surface=settings.first_surface, normal=settings.normal)
@@ -177,7 +177,7 @@ class TransmissiveMethod(GlassStage):
         return FirstBounce(depth, alpha, thickness, beyond)
 
     def losses(self, rendered: RenderedView, view: View, step: int) -> LossTerms:
-        """Those of the second stage, L_d, and the interface's normals (methods.md 5, 5.1)."""
+        """Those of the second stage, L_d, and the interface's normals (method.md 5, 5.1)."""
         found = super().losses(rendered, view, step)
         loss, interface = self.settings.loss, self.settings.transmittance.interface
         if rendered.first_bounce is not None:

@@ -1,5 +1,5 @@
 """Where the transmittance set comes from: base surfels inside the object or behind the pane, or random ones in a box
-(methods.md 6.2)."""
+(method.md 6.2)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.gaussians.density import RowPlan, apply_plan, select_rows
 from rtgs.gaussians.initialize import points_box
 from rtgs.gaussians.materials import MaterialSurfels, without_materials
@@ -64,6 +64,6 @@ def random_surfels(settings: TransmittanceSettings, box: Tensor, generator: torc
 
 
 def initial_box(settings: TransmittanceSettings, mesh: ObjectMesh, cameras, points: Tensor) -> Tensor:
-    """(2, 3) where a random set begins: the object's box, or the scene's (register row 16)."""
+    """(2, 3) where a random set begins: the object's box, or the scene's (decision 16)."""
     usable = points[torch.isfinite(points).all(dim=1)]
     return points_box(usable) if settings.box == "scene" else mesh.transmittance_box(cameras, usable)

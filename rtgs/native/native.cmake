@@ -2,36 +2,36 @@
 # rtgs::<isa>; binding sources once, for the baseline. Kernels hold no STL: the linker may keep the AVX-512 copy of a
 # weak template symbol and hand it to an old machine.
 set(RTGS_KERNELS
-  photometric_kernels.cpp
-  normal_kernels.cpp
-  surfel_kernels.cpp
-  optimizer_kernels.cpp
-  mirror_kernels.cpp
-  project_kernels.cpp
-  project_backward.cpp
-  raster_bins.cpp
-  raster_forward.cpp
-  raster_backward.cpp
-  ellipsoid_project.cpp
-  ellipsoid_project_backward.cpp
-  ellipsoid_tiles.cpp
-  bvh_boxes.cpp
-  trace_records.cpp
-  trace_order.cpp
-  trace_forward.cpp
-  trace_backward.cpp
-  trace_gradients.cpp)
+  image/photometric.cpp
+  image/normal.cpp
+  gaussians/activation.cpp
+  optimizer/adam.cpp
+  image/mirror.cpp
+  raster/surfel_project.cpp
+  raster/surfel_project_backward.cpp
+  raster/bins.cpp
+  raster/forward.cpp
+  raster/backward.cpp
+  raster/ellipsoid_project.cpp
+  raster/ellipsoid_project_backward.cpp
+  raster/ellipsoid_tiles.cpp
+  trace/bvh_boxes.cpp
+  trace/records.cpp
+  trace/order.cpp
+  trace/forward.cpp
+  trace/backward.cpp
+  trace/gradients.cpp)
 set(RTGS_BINDINGS
-  module.cpp
-  isa.cpp
-  bind_image.cpp
-  bind_surfels.cpp
-  bind_optimizer.cpp
-  bind_mirror.cpp
-  bind_raster.cpp
-  bind_ellipsoids.cpp
-  bvh_tree.cpp
-  bind_trace.cpp)
+  bind/module.cpp
+  common/isa.cpp
+  bind/image.cpp
+  bind/activation.cpp
+  bind/optimizer.cpp
+  bind/mirror.cpp
+  bind/raster.cpp
+  bind/ellipsoids.cpp
+  trace/bvh_tree.cpp
+  bind/trace.cpp)
 
 set(RTGS_ISAS portable)
 set(RTGS_FLAGS_portable "")
@@ -45,11 +45,13 @@ nanobind_add_module(_core NB_STATIC)
 list(TRANSFORM RTGS_KERNELS PREPEND ${RTGS_NATIVE}/)
 list(TRANSFORM RTGS_BINDINGS PREPEND ${RTGS_NATIVE}/)
 target_sources(_core PRIVATE ${RTGS_BINDINGS})
+target_include_directories(_core PRIVATE ${RTGS_NATIVE})
 target_link_libraries(_core PRIVATE OpenMP::OpenMP_CXX)
 
 foreach(isa ${RTGS_ISAS})
   set(objects rtgs_kernels_${isa})
   add_library(${objects} OBJECT ${RTGS_KERNELS})
+  target_include_directories(${objects} PRIVATE ${RTGS_NATIVE})
   target_compile_definitions(${objects} PRIVATE RTGS_ISA=${isa} RTGS_ISA_${isa}=1)
   # fast-math when compiling only: linking with it would set flush-to-zero for the whole Python process.
   target_compile_options(${objects} PRIVATE -O3 -ffast-math -fno-finite-math-only -Wno-psabi ${RTGS_FLAGS_${isa}})

@@ -1,4 +1,4 @@
-"""The microfacet weights of one mirror ray and one straight ray, in closed form (methods.md 4, paper eq. 5 to 9).
+"""The microfacet weights of one mirror ray and one straight ray, in closed form (method.md 4, paper eq. 5 to 9).
 
 Plain torch, any dtype, differentiable. With the half vector at the normal (a mirror ray) the Torrance-Sparrow term has
 one cosine c = n . omega_o = n . omega_i and one width g, and needs no half vector:
@@ -6,7 +6,7 @@ one cosine c = n . omega_o = n . omega_i and one width g, and needs no half vect
     D G (n . omega_i) / (4 (n . omega_o) (n . omega_i)) = S(c, g) = 1 / (4 pi g^2 sqrt(c^2 + g^2 (1 - c^2)))
 
 The symbols f_r, f_t of the paper's blend are read as weights that include the cosine of its integral: only then is the
-weight of transmission exactly 1 - F (methods.md 4.3).
+weight of transmission exactly 1 - F (method.md 4.3).
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def remap_roughness(roughness: Tensor, floor: float = 1e-3) -> Tensor:
 
 
 def microfacet_width(roughness: Tensor, settings: OpticsSettings) -> Tensor:
-    """The g that D and G see: the remap, or the roughness itself (register row 2)."""
+    """The g that D and G see: the remap, or the roughness itself (decision 2)."""
     if settings.remap == "none":
         return roughness.clamp_min(settings.roughness_floor)
     return remap_roughness(roughness, settings.roughness_floor)
@@ -63,7 +63,7 @@ def smith_lambda(cosine: Tensor, width: Tensor) -> Tensor:
 
 
 def smith_masking(cosine_in: Tensor, cosine_out: Tensor, width: Tensor, masking: str = "correlated") -> Tensor:
-    """G of both directions: height-correlated 1/(1 + L_i + L_o), or the product of two 1/(1 + L) (register row 4)."""
+    """G of both directions: height-correlated 1/(1 + L_i + L_o), or the product of two 1/(1 + L) (decision 4)."""
     inward, outward = smith_lambda(cosine_in, width), smith_lambda(cosine_out, width)
     if masking == "separable":
         return 1 / ((1 + inward) * (1 + outward))
@@ -84,7 +84,7 @@ def inverse_gain(cosine: Tensor, width: Tensor, masking: str = "correlated") -> 
 
 
 def specular_weights(cosine: Tensor, roughness: Tensor, f0: Tensor, settings: OpticsSettings) -> SpecularWeights:
-    """Weights of the reflected and of the transmitted colour (methods.md 4.4).
+    """Weights of the reflected and of the transmitted colour (method.md 4.4).
 
     Args:
         cosine: (...) n . omega_o; any value, clamped to ``cosine_floor``..1.

@@ -13,13 +13,13 @@ BLENDS = ("srgb", "linear")
 
 @dataclass(frozen=True)
 class OpticsSettings:
-    """The weights in front of the traced colours (methods.md 4.2 to 4.4; register rows 1 to 5)."""
+    """The weights in front of the traced colours (method.md 4.2 to 4.4; decisions 1 to 5)."""
 
     weight: str = (
         "microfacet"  # or "literal" (paper's blend without the cosine), "split_sum" (its ablation), "envgs" (1)
     )
     # S_max, bound of the microfacet gain: 1 conserves energy and is nearly the same from all angles, 0 = no bound (the
-    # paper), 16 = methods.md 4.4; chosen in docs/reflection.md.
+    # paper), 16 = method.md 4.4; chosen in docs/reflection.md.
     max_gain: float = 1.0
     remap: str = "pbrt"  # width g(alpha) of the paper, once squared in D and G; "none": g = alpha
     roughness_floor: float = 1e-3  # argument of g (PBRT): below 1.55e-4 the remap turns round

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 
-from rtgs.errors import RtgsError
+from rtgs.core.errors import RtgsError
 
 
 class PrepareError(RtgsError):

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-from rtgs.prepare.adapters import ADAPTERS, NormalAdapter
 from rtgs.prepare.errors import PrepareError, check_choice
+from rtgs.prepare.normals.adapters import ADAPTERS, NormalAdapter
 
 USE = ("auto", "always", "never")
 MATCHING = ("auto", "exhaustive", "sequential", "retrieval")
@@ -191,7 +191,7 @@ class NormalSettings:
     """``auto``: where a loss of the method reads them, none are given, and the network's file is there. ``always``:
     also without such a loss or in place of given ones, and a missing file is an error. ``never``."""
     model: str = "stablenormal"
-    """``stablenormal``, ``dsine``, ``omnidata``, ``metric3d`` (:mod:`rtgs.prepare.adapters` declares what their
+    """``stablenormal``, ``dsine``, ``omnidata``, ``metric3d`` (:mod:`rtgs.prepare.normals.adapters` declares what their
     numbers mean), or ``custom``: as ``adapter`` says."""
     file: str = ""
     """ONNX file. Empty: the registered name in the folders of weights (``rtgs weights status``)."""

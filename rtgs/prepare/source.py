@@ -7,14 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rtgs.prepare.errors import PrepareError
-from rtgs.prepare.photos import VIDEO_SUFFIXES, find_photo_folder, photo_files, read_photo_set
-from rtgs.prepare.poses import Request, check_count, ignored_folders
+from rtgs.prepare.poses.find import Request, check_count, ignored_folders
+from rtgs.prepare.poses.photos import VIDEO_SUFFIXES, find_photo_folder, photo_files, read_photo_set
 from rtgs.prepare.settings import SfmSettings
 from rtgs.scenes.capture import Finding, list_some
 from rtgs.scenes.check import check_capture
-from rtgs.scenes.colmap import incomplete_model
 from rtgs.scenes.digest import files_digest
-from rtgs.scenes.importers import EMBEDDED_PREFIX, capture_root, detect_format, find_format
+from rtgs.scenes.importers.colmap import incomplete_model
+from rtgs.scenes.importers.registry import EMBEDDED_PREFIX, capture_root, detect_format, find_format
 from rtgs.scenes.settings import CaptureError, SceneSettings
 
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.gaussians.harmonics import MAX_DEGREE, rest_count
 from rtgs.render.buffers import TraceOptions
 

@@ -41,7 +41,7 @@ class RasterBuffers:
 class EllipsoidOptions:
     """Cut rules and optional outputs of the ellipsoid rasteriser (docs/rasterizer.md, "Ellipsoids").
 
-    The defaults are those of 3D Gaussian splatting (Kerbl et al. 2023; methods.md 12), but for the support, which is
+    The defaults are those of 3D Gaussian splatting (Kerbl et al. 2023; method.md 12), but for the support, which is
     exact.
     """
 
@@ -78,7 +78,7 @@ class TraceOptions:
     depth: bool = False
     normal: bool = False
     weight_sum: bool = False
-    direction_gradient: Literal["full", "last_sh"] = "full"  # last_sh: as EnvGS's public tracer (methods.md 0 item 6)
+    direction_gradient: Literal["full", "last_sh"] = "full"  # last_sh: as EnvGS's public tracer (method.md 0 item 6)
     sh_direction: Literal["unit", "raw"] = "unit"  # raw: at directions as they are given, as EnvGS's public tracer
     order: Literal["auto", "given", "sorted"] = "auto"  # of the rays in the kernel: as given, or by Morton code
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.native import core
 from rtgs.render.arguments import check_float32, check_shapes, check_size
 from rtgs.render.buffers import EllipsoidBuffers, EllipsoidOptions
@@ -31,7 +31,7 @@ def rasterize_ellipsoids(
     options: EllipsoidOptions = _DEFAULT_OPTIONS,
     screen_probe: Tensor | None = None,
 ) -> EllipsoidBuffers:
-    """Render N ellipsoids; :func:`rtgs.render.reference_ellipsoids.rasterize_ellipsoids` is its float64 twin.
+    """Render N ellipsoids; :func:`rtgs.render.reference.ellipsoids.rasterize_ellipsoids` is its float64 twin.
 
     Runs on ``torch.get_num_threads()`` threads; the result does not depend on their number, bit for bit. First
     derivatives only: a second backward pass through the gradients raises.
@@ -54,7 +54,7 @@ def rasterize_ellipsoids(
     check_shapes(means, tangent_u, tangent_v, scales, opacities, features, background, screen_probe, scale_axes=3)
     named = {"means": means, "tangent_u": tangent_u, "tangent_v": tangent_v, "scales": scales, "opacities": opacities}
     named |= {"features": features, "background": background, "screen_probe": screen_probe}
-    check_float32(named, "rtgs.render.reference_ellipsoids")
+    check_float32(named, "rtgs.render.reference.ellipsoids")
     _check_options(options)
     check_size(camera)
     if background is not None:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.gaussians.primitives import Gaussians
 
 BULK = (0.02, 0.98)  # quantiles of each coordinate, weighted by opacity, between which the bulk of a model lies

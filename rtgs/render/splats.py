@@ -5,13 +5,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.gaussians.activate import activate_surfels
 from rtgs.gaussians.ellipsoids import Ellipsoids
 from rtgs.gaussians.surfels import Surfels
 from rtgs.render.buffers import EllipsoidOptions, RasterOptions
 from rtgs.render.ellipsoids import rasterize_ellipsoids
-from rtgs.render.rasterize import rasterize_surfels
+from rtgs.render.surfels import rasterize_surfels
 
 
 @torch.no_grad()

@@ -112,7 +112,7 @@ def trace_surfels(
     options: TraceOptions = _DEFAULT_OPTIONS,
     probe: Tensor | None = None,
 ) -> TraceBuffers:
-    """Trace R rays through N surfels; :func:`rtgs.render.reference_trace.trace_surfels` is its float64 twin.
+    """Trace R rays through N surfels; :func:`rtgs.render.reference.trace.trace_surfels` is its float64 twin.
 
     Runs on ``torch.get_num_threads()`` threads; the result does not depend on their number, bit for bit. First
     derivatives only: a second backward pass through the gradients raises.
@@ -128,7 +128,7 @@ def trace_surfels(
         sh_dc, sh_rest: (N, 3) and (N, K, 3), K = 0, 3, 8 or 15: colour, evaluated at the unit ray direction.
         options: bounds, cuts, optional outputs, which directions and gradients, order of the rays in the kernel.
         probe: (N, 3), any values: its gradient receives the densification signal, the sum over hits of
-            dL/dmean * 0.5 * t (methods.md 3.2).
+            dL/dmean * 0.5 * t (method.md 3.2).
 
     Raises:
         ValueError: a shape, a dtype, an option or the tree does not fit; the message names the argument.
@@ -137,7 +137,7 @@ def trace_surfels(
     check_trace_shapes(surfels, origins, directions, features, sh_dc, sh_rest, probe, options)
     others = {"origins": origins, "directions": directions, "features": features, "probe": probe}
     others |= {"sh_dc": sh_dc, "sh_rest": sh_rest, "t_min": options.t_min, "t_max": options.t_max}
-    check_float32(surfels | {n: t for n, t in others.items() if isinstance(t, Tensor)}, "rtgs.render.reference_trace")
+    check_float32(surfels | {n: t for n, t in others.items() if isinstance(t, Tensor)}, "rtgs.render.reference.trace")
     tree = _fitting_tree(tree, surfels, options.alpha_cutoff)
     if sh_dc is not None and sh_rest is None:
         sh_rest = sh_dc.new_empty(len(sh_dc), 0, 3)
@@ -234,7 +234,7 @@ def _tree_arrays(
 ) -> list:
     surfels = _named(means, tangent_u, tangent_v, scales, opacities)
     check_tree_shapes(surfels, alpha_cutoff)
-    check_float32(surfels, "rtgs.render.reference_trace")
+    check_float32(surfels, "rtgs.render.reference.trace")
     return [_array(tensor.contiguous()) for tensor in surfels.values()]
 
 

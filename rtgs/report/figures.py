@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.evaluate.images import colorize
 from rtgs.mesh.guide import MeshGuide
 from rtgs.mesh.triangles import TriangleMesh

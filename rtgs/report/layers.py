@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.evaluate.images import to_bytes
 from rtgs.evaluate.layers import encoded
 from rtgs.report.figures import alpha_picture, normal_picture

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.evaluate.images import ERROR_COLORMAP, ERROR_FULL_SCALE, error_map, to_bytes
 from rtgs.evaluate.records import EvaluationTable, ViewScore
 from rtgs.report.figures import (

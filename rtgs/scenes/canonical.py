@@ -11,7 +11,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.scenes.scene import Scene, View
 from rtgs.scenes.settings import CaptureError
 from rtgs.scenes.truth import ViewTruth

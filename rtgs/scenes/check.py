@@ -20,7 +20,7 @@ from rtgs.scenes.images import (
     read_photo,
     same_aspect,
 )
-from rtgs.scenes.importers import read_capture
+from rtgs.scenes.importers.registry import read_capture
 from rtgs.scenes.points import camera_extent, filter_points, too_few_points
 from rtgs.scenes.settings import CaptureError, SceneSettings
 from rtgs.scenes.splits import Split, choose_split

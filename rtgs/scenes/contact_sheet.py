@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from rtgs.scenes.embedded import embedded_folder, embedded_names
 from rtgs.scenes.images import area_resize
+from rtgs.scenes.importers.embedded import embedded_folder, embedded_names
 from rtgs.scenes.scene import View, load_scene
 from rtgs.scenes.settings import CaptureError, SceneSettings
 from rtgs.scenes.synthetic.record import CaptureRecord

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from rtgs.scenes.capture import raise_errors
 from rtgs.scenes.findings import missing_files
-from rtgs.scenes.importers import read_capture
+from rtgs.scenes.importers.registry import read_capture
 from rtgs.scenes.once import remembered
 from rtgs.scenes.settings import CaptureError, SceneSettings
 from rtgs.scenes.splits import select_views

@@ -59,7 +59,7 @@ def filter_points(
 
     Dropped are: non-finite positions or colours; exact copies of an earlier position (their nearest-neighbour distance
     of zero would make the initial scale vanish); points within ``near_camera`` * ``extent`` of a camera centre
-    (methods.md 13: they cover every pixel); points farther from the mean camera than ``far_factor`` times the 90th
+    (method.md 13: they cover every pixel); points farther from the mean camera than ``far_factor`` times the 90th
     percentile of that distance (mis-triangulated: true backgrounds lie within a few times that percentile), if there
     are at least 20 points.
 

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.scenes.capture import Capture, CaptureView, PointCloud, raise_errors
 from rtgs.scenes.findings import capture_findings
 from rtgs.scenes.images import (
@@ -23,7 +23,7 @@ from rtgs.scenes.images import (
     target_size,
     unit_or_zero,
 )
-from rtgs.scenes.importers import read_capture
+from rtgs.scenes.importers.registry import read_capture
 from rtgs.scenes.points import camera_extent, filter_points, random_points, too_few_points
 from rtgs.scenes.settings import CaptureError, SceneSettings
 from rtgs.scenes.splits import choose_split, select_views

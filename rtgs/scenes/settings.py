@@ -32,10 +32,10 @@ class SceneSettings:
     long_side: int | None = None
     """Long side of the views in pixels, reached by area averaging; never enlarged. None: the photo's own size."""
     resize_ratio: float | None = None
-    """A factor in (0, 1] on width and height, truncated by int() as EnvGS does (methods.md 8.1: 0.25 for Ref-Real);
+    """A factor in (0, 1] on width and height, truncated by int() as EnvGS does (method.md 8.1: 0.25 for Ref-Real);
     with a ``long_side`` as well, as the presets set it, the smaller size of the two."""
     split_every: int = 8
-    """Views whose index in name order is divisible by it are test views (methods.md 8.1). 0: no test views."""
+    """Views whose index in name order is divisible by it are test views (method.md 8.1). 0: no test views."""
     split_file: str | None = None
     """JSON with lists ``train`` and ``test`` of image names; goes before the format's own split and ``split_every``.
     Without ``train`` every other view is for training; views in neither list are left out."""
@@ -44,7 +44,7 @@ class SceneSettings:
     model_dir: str | None = None
     """Folder of the COLMAP model. None: sparse/0, sparse, colmap/sparse/0, colmap/sparse, or ``path``."""
     masks_dir: str = "masks"
-    """Folder of ``<image stem>.png`` or ``<image name>.png``, non-zero = transparent object (methods.md 7).
+    """Folder of ``<image stem>.png`` or ``<image name>.png``, non-zero = transparent object (method.md 7).
     Empty string: ignore masks."""
     normals_dir: str = "normals"
     """Folder of ``<image stem>.png`` (2 rgb - 1) or ``.npy`` ((H, W, 3)) camera-frame normals. Empty string: ignore."""
@@ -70,7 +70,7 @@ class SceneSettings:
     max_point_error: float | None = None
     """COLMAP points with a larger mean reprojection error in pixels are dropped. None: keep all."""
     near_camera: float = 1e-2
-    """Points nearer than this times the scene extent to a camera centre are dropped (methods.md 13, 14)."""
+    """Points nearer than this times the scene extent to a camera centre are dropped (method.md 13, 14)."""
     far_factor: float = 30.0
     """Points farther from the cameras' mean than this times the 90th percentile of that distance are dropped as
     mis-triangulated. 0: keep all."""

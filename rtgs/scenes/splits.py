@@ -1,4 +1,4 @@
-"""Which views are used, and which of them are for training and which for testing (methods.md 8.1)."""
+"""Which views are used, and which of them are for training and which for testing (method.md 8.1)."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rtgs.errors import RtgsError
+from rtgs.core.errors import RtgsError
 from rtgs.track.null import NullTracker, NullTracking
 from rtgs.track.protocol import RunInfo, Tracker, Tracking
 

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from filelock import FileLock, Timeout
 
-from rtgs.errors import RtgsError
+from rtgs.core.errors import RtgsError
 from rtgs.track.protocol import RunInfo, Scalar, Tracker, as_uint8, identity, mark_new
 
 if TYPE_CHECKING:

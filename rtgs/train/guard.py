@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from rtgs.errors import RtgsError
+from rtgs.core.errors import RtgsError
 
 if TYPE_CHECKING:
     from rtgs.methods.base import LossTerms, Method

@@ -1,4 +1,4 @@
-"""Losses on rendered pictures, native forward and backward (methods.md 3.1 "Post", 5, 9).
+"""Losses on rendered pictures, native forward and backward (method.md 3.1 "Post", 5, 9).
 
 Float32 on the CPU. The same functions in plain torch, for any dtype: ``rtgs.train.reference_losses``. Every kernel
 computes its gradient in the forward sweep, so a backward pass costs at most one multiplication. Reductions run in a
@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.native import core
 
 MIN_ALPHA = 1e-6  # at or below it a pixel has no surface: its expected depth is 0
@@ -31,9 +31,9 @@ class PhotometricLoss:
 
 
 def photometric_loss(image: Tensor, target: Tensor, l1: float = 0.8, dssim: float = 0.2) -> PhotometricLoss:
-    """l1 * mean|image - target| + dssim * (1 - SSIM), methods.md 5 L_rgb.
+    """l1 * mean|image - target| + dssim * (1 - SSIM), method.md 5 L_rgb.
 
-    ``image``, ``target`` (C, H, W) float32, range 0..1 (values outside are legal). SSIM as in methods.md 9: Gaussian
+    ``image``, ``target`` (C, H, W) float32, range 0..1 (values outside are legal). SSIM as in method.md 9: Gaussian
     window 11x11 of sigma 1.5, zero padding, per channel, C1 = 0.01^2, C2 = 0.03^2. Differentiable in ``image`` only.
     Raises ValueError for other shapes, dtypes, or a target that requires a gradient.
     """
@@ -43,7 +43,7 @@ def photometric_loss(image: Tensor, target: Tensor, l1: float = 0.8, dssim: floa
 
 
 def ssim(image: Tensor, target: Tensor) -> Tensor:
-    """Mean SSIM (scalar tensor, no gradient) of two pictures (C, H, W) float32, range 0..1, as in methods.md 9."""
+    """Mean SSIM (scalar tensor, no gradient) of two pictures (C, H, W) float32, range 0..1, as in method.md 9."""
     _check_pair(image, target)
     _, dissimilarity = core.photometric_loss(_data(image), _data(target), 0.0, 1.0, True, None, None, _threads())
     return torch.tensor(1.0 - dissimilarity)
@@ -66,7 +66,7 @@ def normal_consistency_loss(
     inverse_depth_weight: bool = False,
     depth_override: Tensor | None = None,
 ) -> Tensor:
-    """mean over all pixels of weight * (1 - N . (A N_d)), methods.md 5 L_norm; scalar.
+    """mean over all pixels of weight * (1 - N . (A N_d)), method.md 5 L_norm; scalar.
 
     ``normal`` (3, H, W) world, sum of w n; ``depth`` (H, W) sum of w z; ``alpha`` (H, W). N_d is the unit normal of the
     back-projected surface depth = depth / alpha (0 where alpha <= MIN_ALPHA): central differences over +-1 pixel,
@@ -95,7 +95,7 @@ def normal_consistency_loss(
 def mono_normal_loss(
     normal: Tensor, mono_normal: Tensor, camera: Camera, *, form: str = "cosine", weight: Tensor | None = None
 ) -> Tensor:
-    """Distance to monocular normals, mean over all pixels, methods.md 5 L_mono; scalar.
+    """Distance to monocular normals, mean over all pixels, method.md 5 L_mono; scalar.
 
     ``normal`` (3, H, W) world, any length: turned to the camera frame and normalised to n (zero where shorter than
     1e-6). ``mono_normal`` m (3, H, W) camera frame (x right, y down, z forward), unit and facing the camera, or zero
@@ -119,7 +119,7 @@ def distortion_loss(distortion: Tensor) -> Tensor:
 
 
 def surface_depth(depth: Tensor, alpha: Tensor, median_depth: Tensor | None = None, depth_ratio: float = 0.0) -> Tensor:
-    """(1 - depth_ratio) * depth / alpha + depth_ratio * median_depth, (H, W); methods.md 3.1 "Post".
+    """(1 - depth_ratio) * depth / alpha + depth_ratio * median_depth, (H, W); method.md 3.1 "Post".
 
     Differentiable, any dtype. The quotient is 0 where alpha <= MIN_ALPHA. Raises ValueError when a ratio above 0 has no
     median depth to mix.
@@ -149,7 +149,7 @@ def depth_normals(depth: Tensor, camera: Camera) -> Tensor:
 
 
 def inverse_depth_weights(depth: Tensor, alpha: Tensor | None = None) -> Tensor:
-    """(H, W) 1 - (d - p1) / (p99 - p1) clipped to 0..1 (EnvGS, methods.md 5), no gradient.
+    """(H, W) 1 - (d - p1) / (p99 - p1) clipped to 0..1 (EnvGS, method.md 5), no gradient.
 
     d = depth / alpha, or ``depth`` itself without ``alpha``; both (H, W) float32. The percentiles are those of the
     covered pixels (d > 0: empty ones say nothing of the scene's depth), nearest rank, over a regular grid of about

@@ -1,4 +1,4 @@
-"""L_perc on random crops (methods.md 5; register row 20). Only where the pretrained VGG-16 is on this machine."""
+"""L_perc on random crops (method.md 5; decision 20). Only where the pretrained VGG-16 is on this machine."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from rtgs.evaluate.lpips import InputRange, Lpips
-from rtgs.evaluate.weights import LPIPS_VGG, VGG16, find_weights
+from rtgs.pretrained.lpips import InputRange, Lpips
+from rtgs.pretrained.weights import LPIPS_VGG, VGG16, find_weights
 from rtgs.train.settings import LossSettings
 
 

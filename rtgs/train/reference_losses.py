@@ -1,6 +1,6 @@
 """The losses of ``rtgs.train.losses`` in plain torch, any dtype (float64 in tests), autograd by torch.
 
-Written from the formulas of methods.md 3.1 "Post", 5 and 9, not from the kernels; only the rules for empty pixels are
+Written from the formulas of method.md 3.1 "Post", 5 and 9, not from the kernels; only the rules for empty pixels are
 shared.
 """
 
@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.train.losses import PERCENTILE_SAMPLES, PhotometricLoss, surface_depth
 
 WINDOW_RADIUS = 5

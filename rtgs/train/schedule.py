@@ -65,7 +65,7 @@ def loss_start(share: float, total: int) -> int:
 
 @dataclass(frozen=True)
 class ReflectionPlan:
-    """When the second stage does what, in steps of this run (methods.md 6.1, 6.2)."""
+    """When the second stage does what, in steps of this run (method.md 6.1, 6.2)."""
 
     start: int  # first step with reflection
     judged: int  # before this step the scene is judged: matte or not; ``start``: it never is
@@ -134,7 +134,7 @@ def base_densify_due(plan: ReflectionPlan, settings: ReflectionSettings, step: i
 
 @dataclass(frozen=True)
 class TransmittancePlan:
-    """When the third stage does what (methods.md 6.2)."""
+    """When the third stage does what (method.md 6.2)."""
 
     start: int  # first step with straight rays
     own: ScheduleSettings  # of the transmittance set on its own clock, which is 0 at ``start``

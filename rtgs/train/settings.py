@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
+from rtgs.core.refuse import refuse_bad_numbers, refuse_unless
 from rtgs.optics.settings import OpticsSettings
-from rtgs.train.refuse import refuse_bad_numbers, refuse_unless
 from rtgs.train.specular_settings import (
     InterfaceSettings,
     MaterialSettings,
@@ -20,7 +20,7 @@ from rtgs.train.specular_settings import (
 
 @dataclass(frozen=True)
 class OptimizerSettings:
-    """Adam, one learning rate per parameter (methods.md 6.1; EnvGS and 2DGS agree)."""
+    """Adam, one learning rate per parameter (method.md 6.1; EnvGS and 2DGS agree)."""
 
     means_initial: float = 1.6e-4  # times the scene extent
     means_final: float = 1.6e-6  # times the scene extent; exponential in between over schedule.means_lr_steps
@@ -35,7 +35,7 @@ class OptimizerSettings:
     beta1: float = 0.9
     beta2: float = 0.999
     eps: float = 1e-15
-    # Ranges the raw parameters are clamped to after every step, so that the activations stay finite (methods.md 14).
+    # Ranges the raw parameters are clamped to after every step, so that the activations stay finite (method.md 14).
     opacity_logit_limit: float = 13.8  # sigmoid within 1e-6 of 0 and 1
     smallest_scale: float = 1e-6  # times the scene extent
     largest_scale: float = 100.0  # times the scene extent
@@ -51,7 +51,7 @@ class OptimizerSettings:
 
 @dataclass(frozen=True)
 class LossSettings:
-    """Weights of the loss terms (methods.md 5). A zero weight means the term is never computed.
+    """Weights of the loss terms (method.md 5). A zero weight means the term is never computed.
 
     ``*_start`` is the share of the run's total steps after which a term is on: the one kind of boundary that keeps its
     sense when a run shrinks from 60,000 steps to 2,000, so methods own it and presets do not repeat it.
@@ -69,16 +69,16 @@ class LossSettings:
     mono_normal_form: str = "cosine"  # "cosine" (paper: 1 - n.N) or "envgs" (|difference|_1 + 1 - cos)
     distortion: float = 0.0  # 2DGS: 0 unbounded, 1000 bounded
     distortion_start: float = 0.1  # 2DGS: from 3,000 of 30,000
-    # Perceptual loss of the second stage, where the VGG weights are there (register row 20).
+    # Perceptual loss of the second stage, where the VGG weights are there (decision 20).
     perceptual: float = 0.0  # RT-GS and EnvGS 0.01
     perceptual_start: float = 0.35  # 21,000 of 60,000
     perceptual_form: str = "lpips"  # LPIPS-VGG on [0, 1] images, as EnvGS; "vgg_l1": L1 of raw VGG features
     perceptual_crop: int = 64  # side of the random crop it looks at: the whole image would dwarf the rest of a step
-    # L_spec, mean of mask * ReLU(target - k_s): where the scene has masks of transparent objects (register row 10).
+    # L_spec, mean of mask * ReLU(target - k_s): where the scene has masks of transparent objects (decision 10).
     specular: float = 0.0  # RT-GS 0.2, from its third stage on
     specular_start: float = 1 / 3  # 20,000 of 60,000
     specular_target: float = 0.9  # K_0: soft, the diffuse colour keeps a tenth
-    # L_d: the first straight ray's hits lie before the back surface (methods.md 5.1; register row 11).
+    # L_d: the first straight ray's hits lie before the back surface (method.md 5.1; decision 11).
     transmission_depth: float = 0.0  # RT-GS 0.2
     transmission_depth_start: float = 2 / 3  # 40,000 of 60,000
     transmission_depth_form: str = "accum"  # of sum w t; "mean": divided by sum w; "per_hit": each hit by itself
@@ -121,7 +121,7 @@ DENSITY_STRATEGIES = ("adaptive", "mcmc")
 
 @dataclass(frozen=True)
 class DensitySettings:
-    """Density control (methods.md 6.1, 12)."""
+    """Density control (method.md 6.1, 12)."""
 
     strategy: str = "adaptive"  # or "mcmc": N grows to the cap and stays; no signal, no opacity resets
     gradient_threshold: float = 2e-4  # mean norm of the densification signal (NDC)
@@ -157,7 +157,7 @@ class DensitySettings:
 
 @dataclass(frozen=True)
 class InitSettings:
-    """Initial surfels from points (methods.md 2)."""
+    """Initial surfels from points (method.md 2)."""
 
     opacity: float = 0.1
     scale: float = 1.0  # times the distance to the neighbours
@@ -188,11 +188,11 @@ class ScheduleSettings:
 class RenderSettings:
     """Rasteriser settings that scale with the scene."""
 
-    near: float = 0.02  # times the scene extent; methods.md 14: absolute 0.2 breaks small scenes
+    near: float = 0.02  # times the scene extent; method.md 14: absolute 0.2 breaks small scenes
     far: float = 20.0  # times the scene extent; distortion mapping only
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     depth_ratio: float = 0.0  # 0 expected depth (unbounded), 1 median depth (bounded objects)
-    # Ellipsoids only (methods.md 12):
+    # Ellipsoids only (method.md 12):
     dilation: float = 0.3  # px^2 added to the projected covariance
     antialiased: bool = False  # the dilated footprint keeps its weight (Mip-Splatting's 2D filter)
 
@@ -206,7 +206,7 @@ def _reflection_density() -> DensitySettings:
 
 @dataclass(frozen=True)
 class ReflectionSettings:
-    """The reflection set and its part of the schedule (methods.md 3.2, 6.1, 6.2).
+    """The reflection set and its part of the schedule (method.md 3.2, 6.1, 6.2).
 
     Boundaries are shares of the run, so that they keep their sense when it shrinks; intervals are steps, because what
     they wait for (views seen, recovery from a reset) takes as many steps in a short run as in a long one. Learning
@@ -218,7 +218,7 @@ class ReflectionSettings:
     densify_every: int = 500
     opacity_reset_every: int = 6_000  # 0 = never; only while densifying
     sh_every: int = 1_000  # one degree more each, from the start of the stage
-    specular_reset: bool = True  # register row 25: at resets of the base set k_s becomes min(k_s, initial)
+    specular_reset: bool = True  # decision 25: at resets of the base set k_s becomes min(k_s, initial)
     cells: int = 32  # per axis of the box: stratified random points (16 at 256x192: kernels.md)
     per_cell: int = 5
     # The points' box reaches at least so far from its middle on every axis, times the extent; 0 = as it is.
@@ -229,14 +229,14 @@ class ReflectionSettings:
     # the "mean" or what a tenth of the pixels exceed ("bright"). Where they are darker than a sky, k_s falls there.
     init_color: str = "random"
     background: str = "black"
-    offset: float = 1e-4  # of the mirror ray's start, times the extent (methods.md 6.3; EnvGS 0)
+    offset: float = 1e-4  # of the mirror ray's start, times the extent (method.md 6.3; EnvGS 0)
     smallest_alpha: float = 1e-2  # pixels with less coverage have no surface to reflect at
     rebuild_every: int = 100  # steps between new trees; in between the tree is refitted (kernels.md)
     # Times the rates of colours and scales: the set starts from noise when the base set is half done.
     rate_gain: float = 1.0
     transmittance_cutoff: float = 1e-4
     alpha_cutoff: float = 1 / 255
-    direction_gradient: str = "full"  # register row 24; "last_sh": what EnvGS's public tracer returns
+    direction_gradient: str = "full"  # decision 24; "last_sh": what EnvGS's public tracer returns
     # Register row 23, of every traced colour: at unit directions, or "raw": rays keep the camera ray's length (EnvGS).
     sh_direction: str = "unit"
     propagation: PropagationSettings = field(default_factory=PropagationSettings)
@@ -284,7 +284,7 @@ _TRANSMITTANCE_CHOICES = {
 
 @dataclass(frozen=True)
 class TransmittanceSettings:
-    """The third stage: straight rays through transparent objects (methods.md 3.3, 4.4, 6.2, 6.3).
+    """The third stage: straight rays through transparent objects (method.md 3.3, 4.4, 6.2, 6.3).
 
     Of scenes with masks only. Boundaries are shares of the run, intervals are steps of the set's own clock, which
     begins with the stage. The first choice of each key is this project's, the paper's way is named beside it.
@@ -292,7 +292,7 @@ class TransmittanceSettings:
 
     enabled: bool = True  # False: the run ends after the second stage
     start: float = 1 / 3  # share of the run: 20,000 of 60,000
-    first_bounce: str = "transmittance"  # register row 26: what it meets; "base": the base set inside; "none": nothing
+    first_bounce: str = "transmittance"  # decision 26: what it meets; "base": the base set inside; "none": nothing
     first_bounce_end: str = "open"  # row 17, the paper relies on L_d; "clip": no hit counts behind the back surface
     second_bounce: str = "mesh"  # row 27: begins at the mesh's back; "first_bounce": at z_s + Z_1; "none"
     second_bounce_gradient: bool = True  # row 13: it teaches the base set

@@ -7,23 +7,23 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from rtgs.train.refuse import refuse_bad_numbers, refuse_unless
+from rtgs.core.refuse import refuse_bad_numbers, refuse_unless
 
 
 @dataclass(frozen=True)
 class MaterialSettings:
-    """What each surfel of the base set says about its surface (methods.md 2, 3.3, 4.2, 4.4)."""
+    """What each surfel of the base set says about its surface (method.md 2, 3.3, 4.2, 4.4)."""
 
-    specular: float = 1e-3  # initial k_s: EnvGS 1e-3 (register row 28: for all scenes); 0.1 for gardenspheres
-    # Initial roughness and reflectance at normal incidence, register row 6. With S_max 1 the weight w_r starts at 0.85
-    # and stays there to grazing, close to EnvGS's 1. With methods.md 4.4's 0.005 and 0.04 it starts at 0.2: a mirror
+    specular: float = 1e-3  # initial k_s: EnvGS 1e-3 (decision 28: for all scenes); 0.1 for gardenspheres
+    # Initial roughness and reflectance at normal incidence, decision 6. With S_max 1 the weight w_r starts at 0.85
+    # and stays there to grazing, close to EnvGS's 1. With method.md 4.4's 0.005 and 0.04 it starts at 0.2: a mirror
     # ray is darker than what it replaces, and k_s falls before the reflection set has learned (docs/reflection.md).
     roughness: float = 0.002
     f0: float = 0.9
-    f0_channels: int = 1  # register row 6: the paper writes a scalar; 3 = rgb
+    f0_channels: int = 1  # decision 6: the paper writes a scalar; 3 = rgb
     roughness_curve: str = "log"  # roughness = floor^(1 - sigmoid(raw)); "linear": floor + (1 - floor) sigmoid(raw)
-    roughness_floor: float = 1e-3  # methods.md 4.2: without it the remap turns round
-    normalized: bool = True  # register row 8: roughness and f0 maps are divided by the accumulated alpha, k_s is not
+    roughness_floor: float = 1e-3  # method.md 4.2: without it the remap turns round
+    normalized: bool = True  # decision 8: roughness and f0 maps are divided by the accumulated alpha, k_s is not
     smallest_alpha: float = 1e-3  # the least they are divided by
 
     def __post_init__(self) -> None:
@@ -45,7 +45,7 @@ class MaterialSettings:
 
 @dataclass(frozen=True)
 class PropagationSettings:
-    """EnvGS's normal propagation and colour sabotage (methods.md 6.1; invented in 3DGS-DR)."""
+    """EnvGS's normal propagation and colour sabotage (method.md 6.1; invented in 3DGS-DR)."""
 
     every: int = 1000  # steps; 0 = never. Not at the steps of an opacity reset
     until: float = 0.3  # share of the run: 18,000 of 60,000

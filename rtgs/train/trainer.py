@@ -309,6 +309,6 @@ def scene_digest(scene: Scene) -> str:
 
 
 def _psnr(image: Tensor, target: Tensor) -> float:
-    """PSNR in dB of an image clamped to [0, 1] (methods.md 9: mse floor 1e-10)."""
+    """PSNR in dB of an image clamped to [0, 1] (method.md 9: mse floor 1e-10)."""
     mse = float((image.clamp(0, 1) - target).square_().mean())
     return -10 * math.log10(max(mse, 1e-10))

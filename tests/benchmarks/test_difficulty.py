@@ -6,7 +6,7 @@ import pytest
 
 from benchmarks import difficulty
 from rtgs.evaluate.records import EvaluationTable, RunFacts, ViewScore
-from rtgs.scenes.embedded import embedded_capture
+from rtgs.scenes.importers.embedded import embedded_capture
 from rtgs.scenes.synthetic.record import CAPTURE_RECORD, CaptureRecord
 
 

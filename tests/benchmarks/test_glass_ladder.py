@@ -28,7 +28,7 @@ from benchmarks.glass_ladder import (
     row,
     sized,
 )
-from pipelines.graph import build_graph
+from pipelines.planning.graph import build_graph
 from rtgs.config import compose
 
 TINY = (

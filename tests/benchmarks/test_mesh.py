@@ -6,7 +6,7 @@ import pytest
 
 from benchmarks import mesh
 from rtgs.mesh.settings import HullSettings
-from rtgs.scenes.embedded import embedded_capture
+from rtgs.scenes.importers.embedded import embedded_capture
 from rtgs.scenes.scene import load_scene
 from rtgs.scenes.settings import SceneSettings
 

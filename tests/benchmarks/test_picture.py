@@ -12,9 +12,9 @@ from PIL import Image
 from safetensors.torch import save_file
 
 from benchmarks import picture
-from pipelines.evaluate import TABLE_JSON
-from pipelines.results import RUN_FILE
-from rtgs.errors import RtgsError
+from pipelines.publishing.results import RUN_FILE
+from pipelines.steps.evaluate import TABLE_JSON
+from rtgs.core.errors import RtgsError
 from rtgs.evaluate.evaluate import EvaluationSettings, TimedRender, evaluate_views
 from rtgs.evaluate.images import file_stem
 from rtgs.evaluate.records import RunFacts, write_json

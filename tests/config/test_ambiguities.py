@@ -1,4 +1,4 @@
-"""Every open question of the paper is a config key (methods.md 10)."""
+"""Every open question of the paper is a config key (method.md 10)."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from dataclasses import asdict
 import pytest
 
 from rtgs.config import compose
-from rtgs.pipeline.fingerprint import flatten
+from rtgs.workflow.fingerprint import flatten
 
-# Row of methods.md 10: the key that decides it, the decision of `method=rtgs preset=paper`, and the alternative kept.
+# Row of method.md 10: the key that decides it, the decision of `method=rtgs preset=paper`, and the alternative kept.
 REGISTER: dict[int, list[tuple[str, object, object]]] = {
     1: [("method.optics.weight", "microfacet", "literal")],
     2: [("method.optics.remap", "pbrt", "none")],

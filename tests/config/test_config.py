@@ -16,20 +16,20 @@ from hydra import initialize_config_dir
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
-from pipelines.graph import build_graph
+from pipelines.planning.graph import build_graph
 from rtgs.config import RunConfig, compose
-from rtgs.config.build import build
 from rtgs.config.compose import VERSION_BASE
 from rtgs.config.convert import derive_name, to_run_config
 from rtgs.config.explain import explain
 from rtgs.config.locate import choices_of, conf_dir
 from rtgs.config.schema import Choices, open_schema, register_schema
 from rtgs.config.sweep import compose_jobs
-from rtgs.errors import RtgsError
+from rtgs.core.build import build
+from rtgs.core.errors import RtgsError
 from rtgs.evaluate.tables import PAPER_SCORES
-from rtgs.pipeline.fingerprint import fingerprint
 from rtgs.scenes.once import captures_read_once
 from rtgs.train.settings import ScheduleSettings
+from rtgs.workflow.fingerprint import fingerprint
 
 ABLATIONS = [name for name in choices_of("ablation") if name != "none"]
 SCENES = [name for name in choices_of("scene") if name != "capture"]

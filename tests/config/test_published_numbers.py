@@ -1,4 +1,4 @@
-"""``preset=paper`` has the numbers of EnvGS (methods.md 6.1) for both sets, in both methods that trace reflections."""
+"""``preset=paper`` has the numbers of EnvGS (method.md 6.1) for both sets, in both methods that trace reflections."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import asdict
 import pytest
 
 from rtgs.config import compose
-from rtgs.pipeline.fingerprint import flatten
+from rtgs.workflow.fingerprint import flatten
 
 RATES = {
     "means_initial": 1.6e-4,

@@ -8,7 +8,7 @@ from hydra.errors import HydraException
 from rtgs.config import compose
 from rtgs.config.explain import explain
 from rtgs.config.sweep import compose_jobs
-from rtgs.errors import RtgsError
+from rtgs.core.errors import RtgsError
 
 
 @pytest.mark.parametrize(

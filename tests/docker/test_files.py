@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from rtgs.pipeline.engine import worker_environment
+from rtgs.workflow.engine import worker_environment
 
 DOCKER = Path(__file__).parents[2] / "docker"
 COMPOSE = DOCKER / "compose.yaml"

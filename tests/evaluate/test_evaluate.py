@@ -11,12 +11,12 @@ import pytest
 import torch
 from PIL import Image
 
-from rtgs.evaluate import weights as pretrained
 from rtgs.evaluate.evaluate import NO_TEST_VIEWS, EvaluationSettings, TimedRender, evaluate_views, write_error_maps
 from rtgs.evaluate.images import colorize, error_map
 from rtgs.evaluate.metrics import psnr, ssim
 from rtgs.evaluate.records import METRICS, RunFacts, read_json, write_csv, write_json
 from rtgs.evaluate.tables import PAPER_SCORES, summarize
+from rtgs.pretrained import weights as pretrained
 
 FACTS = RunFacts("desk", "2dgs", "smoke", steps=300, surfels=1234, train_seconds=12.5, peak_memory_mb=800.0)
 
@@ -86,8 +86,8 @@ def test_lpips_without_weights_is_absent_with_its_reason() -> None:
 
 
 def test_lpips_with_a_model() -> None:
-    from rtgs.evaluate.lpips import Lpips
-    from rtgs.evaluate.vgg import BLOCKS, Vgg16Features
+    from rtgs.pretrained.lpips import Lpips
+    from rtgs.pretrained.vgg import BLOCKS, Vgg16Features
 
     generator = torch.Generator().manual_seed(0)
     tensors, channels = {}, 3

@@ -8,10 +8,10 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from rtgs.evaluate import weights as pretrained
-from rtgs.evaluate.lpips import InputRange, Lpips, lpips
-from rtgs.evaluate.vgg import BLOCKS, VGG16_WIDTHS, Vgg16Features
-from rtgs.evaluate.weights import MissingWeights, WrongWeights
+from rtgs.pretrained import weights as pretrained
+from rtgs.pretrained.lpips import InputRange, Lpips, lpips
+from rtgs.pretrained.vgg import BLOCKS, VGG16_WIDTHS, Vgg16Features
+from rtgs.pretrained.weights import MissingWeights, WrongWeights
 
 TINY = (3, 4, 5, 6, 7)
 

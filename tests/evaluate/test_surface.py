@@ -15,8 +15,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from pipelines.evaluate import object_facts
-from pipelines.report import _guide
+from pipelines.steps.evaluate import object_facts
+from pipelines.steps.report import _guide
 from rtgs.evaluate.evaluate import EvaluationSettings, TimedRender, evaluate_views
 from rtgs.evaluate.publish import Measured, TableSpec, build_table
 from rtgs.evaluate.records import SURFACE_METRICS, EvaluationTable, ObjectFacts, RunFacts, read_json, write_json

@@ -9,9 +9,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rtgs.gaussians.adam import SurfelAdam
 from rtgs.gaussians.density import DensityControl, DensityReport, RowPlan, apply_plan, logit, select_rows, split_surfels
 from rtgs.gaussians.surfels import Surfels, tangents
-from rtgs.train.adam import SurfelAdam
 from rtgs.train.settings import DensitySettings, OptimizerSettings
 
 EXTENT = 2.0  # small <= 0.02 < large <= 0.2 < too large

@@ -10,11 +10,11 @@ from surfel_cases import random_surfels
 from torch import Tensor
 
 from rtgs.gaussians.activate import activate_surfels
+from rtgs.gaussians.adam import SurfelAdam
 from rtgs.gaussians.density import DensityControl, RowPlan, apply_plan, select_rows, split_surfels
 from rtgs.gaussians.ellipsoids import Ellipsoids
 from rtgs.gaussians.primitives import Gaussians
 from rtgs.gaussians.surfels import Surfels
-from rtgs.train.adam import SurfelAdam
 from rtgs.train.settings import DensitySettings, OptimizerSettings
 
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from numpy.lib import recfunctions
 from surfel_cases import random_surfels
 
-from rtgs.errors import RtgsError
+from rtgs.core.errors import RtgsError
 from rtgs.gaussians.ellipsoids import Ellipsoids
 from rtgs.gaussians.harmonics import sh_dc_to_rgb
 from rtgs.gaussians.ply import read_gaussians, write_ply

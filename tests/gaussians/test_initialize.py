@@ -1,4 +1,4 @@
-"""Initial surfels: numbers of methods.md section 2, degenerate clouds, errors."""
+"""Initial surfels: numbers of method.md 2, degenerate clouds, errors."""
 
 import pytest
 import torch

@@ -11,13 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from surfel_cases import random_surfels
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
+from rtgs.gaussians.adam import SurfelAdam
 from rtgs.gaussians.density import DensityControl
 from rtgs.gaussians.ellipsoids import Ellipsoids
 from rtgs.gaussians.mcmc import McmcControl, density_control, draw_copies, shared_opacity, shared_shrink
 from rtgs.gaussians.surfels import Surfels, activate
-from rtgs.render.reference_ellipsoids import rasterize_ellipsoids
-from rtgs.train.adam import SurfelAdam
+from rtgs.render.reference.ellipsoids import rasterize_ellipsoids
 from rtgs.train.settings import DensitySettings, McmcSettings, OptimizerSettings
 
 MCMC = DensitySettings(strategy="mcmc", max_surfels=100, cap_share=1.0)

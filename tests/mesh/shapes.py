@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.mesh.triangles import TriangleMesh
 
 _CUBE_FACES = [  # corners of [0, 1]^3 numbered by bits x + 2 y + 4 z, counter-clockwise from outside

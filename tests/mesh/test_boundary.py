@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.evaluate.boundary import boundary_scores
 from rtgs.mesh.container import ObjectMesh
 from rtgs.methods import RenderedView, RenderOptions

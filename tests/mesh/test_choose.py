@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from rtgs.errors import RtgsError
+from rtgs.core.errors import RtgsError
 from rtgs.mesh.choose import Choice, choose_object_mesh, read_given
 from rtgs.mesh.pane import drawn_pane, fit_pane, is_flat
 from rtgs.mesh.settings import HullSettings, ObjectSettings

@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rtgs.errors import RtgsError
+from rtgs.core.errors import RtgsError
 from rtgs.mesh.container import ObjectGuide, ObjectMesh, read_object_mesh, write_object_mesh
 from rtgs.mesh.normals import corner_normals
 from rtgs.mesh.triangles import TriangleMesh

@@ -11,23 +11,23 @@ import pytest
 import torch
 from PIL import Image
 
-from pipelines import evaluate, report
-from pipelines import extract_mesh as step
-from rtgs.cameras import Camera
+from pipelines.steps import evaluate, report
+from pipelines.steps import extract_mesh as step
 from rtgs.config.schema import MeshConfig, RunConfig
-from rtgs.errors import RtgsError
+from rtgs.core.cameras import Camera
+from rtgs.core.errors import RtgsError
 from rtgs.mesh.container import read_object_mesh
 from rtgs.mesh.score import container_mesh
 from rtgs.mesh.settings import HullSettings, ObjectSettings, TsdfSettings
 from rtgs.mesh.triangles import TriangleMesh, read_mesh_ply, write_mesh_ply
 from rtgs.methods import RenderedView, RenderOptions
-from rtgs.pipeline import StepContext
 from rtgs.render.buffers import RasterBuffers
 from rtgs.scenes.canonical import save_scene
-from rtgs.scenes.embedded import embedded_capture
+from rtgs.scenes.importers.embedded import embedded_capture
 from rtgs.scenes.scene import Scene, View, load_scene
 from rtgs.scenes.settings import SceneSettings
 from rtgs.track.null import NullTracker
+from rtgs.workflow import StepContext
 from tests.mesh.shapes import camera_at, sphere, sphere_depths
 
 PARAMS = step.ExtractMeshParams(TsdfSettings(depth_trunc=6.0, voxel=6.0 / 96), obj=True)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from rtgs.cameras import Camera
-from rtgs.errors import RtgsError
+from rtgs.core.cameras import Camera
+from rtgs.core.errors import RtgsError
 from rtgs.mesh.container import ObjectMesh
 from rtgs.mesh.guide import MeshGuide
 from rtgs.mesh.hull import carve_hull, most_outvoted

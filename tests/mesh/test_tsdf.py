@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from rtgs.cameras import Camera
-from rtgs.errors import RtgsError
+from rtgs.core.cameras import Camera
+from rtgs.core.errors import RtgsError
 from rtgs.mesh.settings import TsdfSettings
 from rtgs.mesh.triangles import TriangleMesh, read_mesh_ply, write_mesh_obj, write_mesh_ply
 from rtgs.mesh.tsdf import (

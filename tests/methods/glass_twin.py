@@ -7,15 +7,16 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.gaussians.materials import MaterialSurfels, activate_materials
 from rtgs.gaussians.surfels import ActivatedSurfels, Surfels, activate
 from rtgs.methods.mirror import SHORTEST_NORMAL, SurfacePixels, mirror_rays, pixel_weights, surface_pixels
 from rtgs.methods.transmittance import TransmissiveMethod
-from rtgs.render import reference, reference_trace
 from rtgs.render.buffers import TraceBuffers, TraceOptions
-from rtgs.render.discontinuities import discontinuity_mask
-from rtgs.render.trace_discontinuities import fragile_rays
+from rtgs.render.discontinuities.surfels import discontinuity_mask
+from rtgs.render.discontinuities.trace import fragile_rays
+from rtgs.render.reference import surfels as reference
+from rtgs.render.reference import trace as reference_trace
 
 Sets = dict[str, Surfels]
 

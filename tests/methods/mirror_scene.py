@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.scenes.scene import Scene, View
 
 BALL, RADIUS = torch.tensor([0.0, 0.0, -0.2]), 0.6

@@ -22,9 +22,10 @@ from rtgs.methods.mirror import (
 from rtgs.methods.reflection_set import scene_color
 from rtgs.methods.reflective import ReflectiveMethod
 from rtgs.optics.settings import OpticsSettings
-from rtgs.render import reference, reference_trace
-from rtgs.render.discontinuities import discontinuity_mask
-from rtgs.render.trace_discontinuities import fragile_rays
+from rtgs.render.discontinuities.surfels import discontinuity_mask
+from rtgs.render.discontinuities.trace import fragile_rays
+from rtgs.render.reference import surfels as reference
+from rtgs.render.reference import trace as reference_trace
 from rtgs.train.specular_settings import MaterialSettings, PropagationSettings
 
 STEP = 40  # SH of degree 2 in both sets

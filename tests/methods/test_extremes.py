@@ -1,4 +1,4 @@
-"""Nothing of a reflection is NaN at the ends of any range, and gradients stay bounded (methods.md 14)."""
+"""Nothing of a reflection is NaN at the ends of any range, and gradients stay bounded (method.md 14)."""
 
 from __future__ import annotations
 

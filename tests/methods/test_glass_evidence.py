@@ -12,7 +12,7 @@ from mirror_scene import BALL, RADIUS, ball_hit
 from reflective_cases import schedule
 from torch import Tensor
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.mesh.container import ObjectGuide, ObjectSurfaces
 from rtgs.methods import RenderOptions
 from rtgs.methods.glass import glass_pixels, widened

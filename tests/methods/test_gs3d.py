@@ -9,7 +9,7 @@ import torch
 from training_cases import small_method, small_scene, small_schedule, small_trainer
 
 from rtgs.config import compose
-from rtgs.errors import RtgsError
+from rtgs.core.errors import RtgsError
 from rtgs.gaussians.ellipsoids import Ellipsoids
 from rtgs.gaussians.ply import read_gaussians, write_ply
 from rtgs.methods import RenderOptions, create_method

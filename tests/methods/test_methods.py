@@ -8,7 +8,7 @@ import pytest
 import torch
 from training_cases import HEIGHT, WIDTH, small_method, small_scene, small_schedule
 
-from rtgs.errors import RtgsError
+from rtgs.core.errors import RtgsError
 from rtgs.methods import METHOD_NAMES, RenderOptions, Stage, create_method, method_stages
 from rtgs.methods import surfel_base as module
 from rtgs.render.buffers import RasterOptions

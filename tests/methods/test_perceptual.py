@@ -9,10 +9,10 @@ import torch
 from reflective_cases import new_method, recipe, schedule, tiny
 from test_lpips import TINY, head_tensors, vgg_tensors
 
-from rtgs.evaluate.lpips import InputRange, Lpips
-from rtgs.evaluate.vgg import Vgg16Features
-from rtgs.evaluate.weights import MissingWeights
 from rtgs.methods import Stage, reflective
+from rtgs.pretrained.lpips import InputRange, Lpips
+from rtgs.pretrained.vgg import Vgg16Features
+from rtgs.pretrained.weights import MissingWeights
 from rtgs.train import perceptual
 from rtgs.train.perceptual import PerceptualLoss
 from rtgs.train.settings import LossSettings

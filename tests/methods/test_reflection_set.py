@@ -16,7 +16,7 @@ from rtgs.methods.propagation import propagate_normals
 from rtgs.methods.reflection_set import reflection_surfels
 from rtgs.methods.traced_set import FollowingTree, trace_set
 from rtgs.render.buffers import TraceOptions
-from rtgs.render.reference_trace import find_hits, traced_rays, traced_surfels
+from rtgs.render.reference.trace import find_hits, traced_rays, traced_surfels
 from rtgs.train.settings import DensitySettings, ReflectionSettings
 from rtgs.train.specular_settings import PropagationSettings
 

@@ -11,7 +11,7 @@ from glass_cases import GlassScene, ball_mesh, begun, glass_recipe, glass_scene,
 from mirror_scene import BALL
 from reflective_cases import schedule
 
-from rtgs.errors import RtgsError
+from rtgs.core.errors import RtgsError
 from rtgs.evaluate.boundary import boundary_scores
 from rtgs.gaussians.density import logit
 from rtgs.mesh.triangles import TriangleMesh

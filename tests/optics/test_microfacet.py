@@ -37,7 +37,7 @@ def f64(*values: float) -> torch.Tensor:
 
 @pytest.mark.parametrize(
     ("roughness", "width", "at_normal"),
-    [  # the table of methods.md 4.2
+    [  # the table of method.md 4.2
         (1e-3, 0.0473, 142.5),
         (5e-3, 0.1033, 29.8),
         (1e-2, 0.1389, 16.5),
@@ -178,7 +178,7 @@ def test_split_sum_at_its_ends():
     np.testing.assert_allclose(table[0, 1:].sum(-1), 1, atol=1e-9)  # a mirror reflects all
     cosine = np.linspace(0, 1, len(table))[1:]
     np.testing.assert_allclose(table[0, 1:, 1], (1 - cosine) ** 5, atol=1e-9)
-    # methods.md 4.3: albedo of the lobe at F = 1 and normal incidence
+    # method.md 4.3: albedo of the lobe at F = 1 and normal incidence
     for width, albedo in ((0.1, 0.99), (0.5, 0.69), (1.0, 0.31)):
         scale, bias = split_sum_factors(f64(1.0), f64(width))
         assert float(scale + bias) == pytest.approx(albedo, abs=0.02)

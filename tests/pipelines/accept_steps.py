@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from pipelines.graph import KINDS
-from rtgs.pipeline.sources import accept_sources, check_sources
+from pipelines.planning.graph import KINDS
+from rtgs.workflow.sources import accept_sources, check_sources
 
 LOCK_FILE = Path(__file__).with_name("steps.lock.json")
 

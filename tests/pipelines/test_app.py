@@ -21,14 +21,15 @@ import yaml
 from PIL import Image
 from safetensors import SafetensorError
 
-from pipelines import import_scene, results
-from pipelines.cli import main, report_error
-from pipelines.import_scene import ImportParams
-from pipelines.results import RunRecord
-from pipelines.words import friendly_overrides
-from rtgs.pipeline import Store
-from rtgs.pipeline.step import StepFailed
+from pipelines.cli.main import main, report_error
+from pipelines.publishing import results
+from pipelines.publishing.results import RunRecord
+from pipelines.steps import import_scene
+from pipelines.steps.import_scene import ImportParams
+from rtgs.config.words import friendly_overrides
 from rtgs.scenes.settings import SceneSettings
+from rtgs.workflow import Store
+from rtgs.workflow.step import StepFailed
 
 WIDTH, HEIGHT, VIEWS = 32, 24, 10
 QUICK = (
@@ -364,7 +365,7 @@ def test_the_module_is_the_same_as_the_command(first, words):
 def slow_modules(words: list[str]) -> str:
     """Which of the modules that take long to import a command loads."""
     code = (
-        "import sys; from pipelines.cli import main; assert main(sys.argv[1:]) == 0; "
+        "import sys; from pipelines.cli.main import main; assert main(sys.argv[1:]) == 0; "
         "print('loaded', sorted({'torch', 'mlflow', 'distributed', 'cv2', 'skimage', 'scipy'} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=True)

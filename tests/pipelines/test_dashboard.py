@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from pipelines.dashboard import GUIDE, overview, serve
-from rtgs.errors import RtgsError
+from pipelines.cli.dashboard import GUIDE, overview, serve
+from rtgs.core.errors import RtgsError
 from rtgs.track import RunInfo
 from rtgs.track.mlflow import MlflowTracking
 

@@ -9,21 +9,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.cli import main
-from pipelines.datasets import TITLES, VIEWS, dataset_states
-from pipelines.graph import build_graph
+from pipelines.cli.main import main
+from pipelines.planning.datasets import TITLES, VIEWS, dataset_states
+from pipelines.planning.graph import build_graph
 from rtgs.config import compose
 from rtgs.config.locate import choices_of, project_root
 from rtgs.config.sweep import compose_jobs
-from rtgs.errors import RtgsError
+from rtgs.core.errors import RtgsError
 from rtgs.scenes.scene import load_scene
 from tests.scenes.captures import ColmapCapture, save_image
 
 VIEW_COUNT = 9
 SIZE = (64, 48)
-NU_NERF = {"ballstatue": 1080, "popcorncup_all": 1080, "real_bottle": 720, "tall_bottle": 1080}  # methods.md 8.2
+NU_NERF = {"ballstatue": 1080, "popcorncup_all": 1080, "real_bottle": 720, "tall_bottle": 1080}  # method.md 8.2
 NU_NERF_SCENES = [f"nu_nerf/{name}" for name in ("ballstatue", "popcorncup", "real_bottle", "tall_bottle")]
-REF_REAL = ("sedan", "gardenspheres", "toycar")  # methods.md 8.1
+REF_REAL = ("sedan", "gardenspheres", "toycar")  # method.md 8.1
 
 
 @pytest.fixture(scope="module")
@@ -132,7 +132,7 @@ def test_the_papers_figures_are_not_for_stand_ins():
 
 
 def test_complete_datasets_are_ready(root, monkeypatch, capsys):
-    monkeypatch.setattr("pipelines.datasets.VIEWS", dict.fromkeys(VIEWS, VIEW_COUNT))
+    monkeypatch.setattr("pipelines.planning.datasets.VIEWS", dict.fromkeys(VIEWS, VIEW_COUNT))
     for data in TITLES:
         assert main(["check", f"data={data}"]) == 0
         shown = capsys.readouterr().out

@@ -19,9 +19,9 @@ import toy
 from distributed import Client, LocalCluster
 from toy import ToyParams, executions, graph
 
-from pipelines.sweep import check_arrived
-from rtgs.errors import RtgsError
-from rtgs.pipeline import (
+from pipelines.planning.sweep import check_arrived
+from rtgs.core.errors import RtgsError
+from rtgs.workflow import (
     InlineExecutor,
     RemoteStore,
     Step,
@@ -31,8 +31,8 @@ from rtgs.pipeline import (
     make_plan,
     topological,
 )
-from rtgs.pipeline.engine import WORKER, DaskExecutor, EngineSettings, WorkerJob, open_client, worker_environment
-from rtgs.pipeline.outcome import StepOutcome
+from rtgs.workflow.engine import WORKER, DaskExecutor, EngineSettings, WorkerJob, open_client, worker_environment
+from rtgs.workflow.outcome import StepOutcome
 
 
 def soon(condition: Callable[[], bool], what: str) -> None:
@@ -103,8 +103,8 @@ def _processing(cluster: LocalCluster, address: str) -> bool:
 def test_after_the_scheduler_is_killed_the_next_run_resumes_from_the_store(tmp_path):
     (tmp_path / "gate").touch()
     program = (
-        "from pathlib import Path; import toy; from rtgs.pipeline import Store, make_plan\n"
-        "from rtgs.pipeline.engine import *\n"
+        "from pathlib import Path; import toy; from rtgs.workflow import Store, make_plan\n"
+        "from rtgs.workflow.engine import *\n"
         f"root = Path({str(tmp_path)!r}); store = Store(root / 'store')\n"
         "if __name__ == '__main__':\n"
         "    with open_client(EngineSettings(workers=2, threads=1)) as client:\n"

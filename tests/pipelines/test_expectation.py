@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import pytest
 from toy import ToyParams, graph, train
 
-from rtgs.pipeline import InlineExecutor, Step, Store, make_plan
-from rtgs.pipeline.expectation import OTHER_SECONDS, Expectation, PlanClock, spoken
-from rtgs.pipeline.manifest import describe
-from rtgs.pipeline.outcome import StepOutcome
-from rtgs.pipeline.progress import plan_progress
+from rtgs.workflow import InlineExecutor, Step, Store, make_plan
+from rtgs.workflow.expectation import OTHER_SECONDS, Expectation, PlanClock, spoken
+from rtgs.workflow.manifest import describe
+from rtgs.workflow.outcome import StepOutcome
+from rtgs.workflow.progress import plan_progress
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from rtgs.optics.settings import OpticsSettings
-from rtgs.pipeline.fingerprint import NOT_IN_RECIPE, UNLESS_DEFAULT, canonical_json, fingerprint, flatten
+from rtgs.workflow.fingerprint import NOT_IN_RECIPE, UNLESS_DEFAULT, canonical_json, fingerprint, flatten
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from pathlib import Path
 import torch
 from safetensors.torch import save_file
 
-from pipelines import render, report, views
+from pipelines.steps import render, report, views
 
 
 def rendered_view(folder: Path, layers: bool) -> dict[str, torch.Tensor]:

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from test_app import QUICK, _in_root, capture, root  # noqa: F401  (fixtures)
 
-from pipelines import pictures
-from pipelines.cli import main
-from pipelines.pictures import fixed_views, training_pictures
-from rtgs.pipeline import Store
+from pipelines.cli.main import main
+from pipelines.steps import pictures
+from pipelines.steps.pictures import fixed_views, training_pictures
 from rtgs.scenes.scene import load_scene
 from rtgs.scenes.settings import SceneSettings
+from rtgs.workflow import Store
 
 SECOND = ("method.reflection.cells=3", "method.reflection.matte.probation=0", "method.loss.perceptual=0")
 

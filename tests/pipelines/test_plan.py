@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from toy import ToyParams, graph, train
 
-from rtgs.errors import RtgsError
-from rtgs.pipeline import InlineExecutor, Step, Store, make_plan
-from rtgs.pipeline.manifest import describe
-from rtgs.pipeline.plan import Neighbours, differences, topological
+from rtgs.core.errors import RtgsError
+from rtgs.workflow import InlineExecutor, Step, Store, make_plan
+from rtgs.workflow.manifest import describe
+from rtgs.workflow.plan import Neighbours, differences, topological
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import toy
 
-from rtgs.pipeline import Store, make_plan
+from rtgs.workflow import Store, make_plan
 
 IDEAL = ["geom from 0", "prep", "train 0.1", "train 0.2", "train 0.3"]
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from test_app import QUICK, _in_root, capture, root  # noqa: F401  (fixtures)
 
-from pipelines.cli import main
-from pipelines.graph import build_graph
-from pipelines.training import stage_params
+from pipelines.cli.main import main
+from pipelines.planning.graph import build_graph
+from pipelines.steps.training import stage_params
 from rtgs.config import compose
 from rtgs.gaussians.materials import MaterialSurfels
 from rtgs.gaussians.ply import read_ply

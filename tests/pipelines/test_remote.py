@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from toy import executions, graph
 
-from rtgs.pipeline import InlineExecutor, RemoteStore, RemoteStoreError, Store, make_plan
-from rtgs.pipeline.manifest import NAME, Manifest, describe
+from rtgs.workflow import InlineExecutor, RemoteStore, RemoteStoreError, Store, make_plan
+from rtgs.workflow.manifest import NAME, Manifest, describe
 
 BUCKET = "artifacts"
 
@@ -221,7 +221,7 @@ def test_an_unknown_kind_of_address_is_refused():
 
 
 def test_the_command_line_pushes_and_pulls(tmp_path, url, capsys):
-    from pipelines.cli import main
+    from pipelines.cli.main import main
 
     store = Store(tmp_path / "one" / "store")
     InlineExecutor(store).execute(make_plan(graph(tmp_path), store))
@@ -238,7 +238,7 @@ def test_the_command_line_pushes_and_pulls(tmp_path, url, capsys):
 
 
 def test_push_and_pull_of_one_run_move_only_its_steps(tmp_path, capsys):
-    from pipelines.cli import main
+    from pipelines.cli.main import main
 
     words = ["scene=demo", "preset=smoke", f"paths.root={tmp_path / 'one'}"]
     shared = str(tmp_path / "shared")

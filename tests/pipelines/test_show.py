@@ -10,10 +10,10 @@ import pytest
 import torch
 from PIL import Image
 
-from pipelines.cli import main
-from pipelines.show import _moved, _read_transform
-from rtgs.cameras import Camera
+from pipelines.cli.main import main
+from pipelines.cli.show import _moved, _read_transform
 from rtgs.config import compose
+from rtgs.core.cameras import Camera
 from rtgs.gaussians.ellipsoids import Ellipsoids
 from rtgs.gaussians.initialize import gaussians_from_points
 from rtgs.gaussians.ply import write_ply

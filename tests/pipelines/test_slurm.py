@@ -20,8 +20,8 @@ import pytest
 import toy
 from test_engine import soon
 
-from rtgs.pipeline import Store, SweepOutcomes, make_plan
-from rtgs.pipeline.engine import DaskExecutor, EngineSettings, WorkerJob, open_client
+from rtgs.workflow import Store, SweepOutcomes, make_plan
+from rtgs.workflow.engine import DaskExecutor, EngineSettings, WorkerJob, open_client
 
 PROGRAMS = ("slurmctld", "slurmd", "sbatch", "squeue", "scancel", "sinfo")
 FOLDERS = ("/usr/sbin", "/sbin")
@@ -151,8 +151,8 @@ def test_cancelled_jobs_are_replaced_and_the_step_resumes(slurm, settings, tmp_p
 def test_when_the_scheduler_is_killed_the_next_run_resumes_from_the_store(slurm, tmp_path):
     (tmp_path / "gate").touch()
     (tmp_path / "drive.py").write_text(
-        "from pathlib import Path; import toy; from rtgs.pipeline import Store, make_plan\n"
-        "from rtgs.pipeline.engine import *\n"
+        "from pathlib import Path; import toy; from rtgs.workflow import Store, make_plan\n"
+        "from rtgs.workflow.engine import *\n"
         f"root = Path({str(tmp_path)!r}); store = Store(root / 'store')\n"
         "settings = EngineSettings(kind='slurm', workers=1, threads=1, memory='1GB', walltime='00:10:00')\n"
         "with open_client(settings) as client:\n"

@@ -6,10 +6,10 @@ from dataclasses import replace
 import pytest
 from accept_steps import LOCK_FILE
 
-from pipelines.graph import KINDS
-from rtgs.errors import RtgsError
-from rtgs.pipeline import StepKind
-from rtgs.pipeline.sources import accept_sources, check_sources, source_hash
+from pipelines.planning.graph import KINDS
+from rtgs.core.errors import RtgsError
+from rtgs.workflow import StepKind
+from rtgs.workflow.sources import accept_sources, check_sources, source_hash
 
 
 def test_no_step_changed_without_a_new_version():

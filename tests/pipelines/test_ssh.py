@@ -16,9 +16,9 @@ import toy
 from test_engine import _count_threads, soon
 from toy import ToyParams
 
-from rtgs.errors import RtgsError
-from rtgs.pipeline import Step, Store, SweepOutcomes, make_plan
-from rtgs.pipeline.engine import DaskExecutor, EngineSettings, WorkerJob, open_client
+from rtgs.core.errors import RtgsError
+from rtgs.workflow import Step, Store, SweepOutcomes, make_plan
+from rtgs.workflow.engine import DaskExecutor, EngineSettings, WorkerJob, open_client
 
 asyncssh = pytest.importorskip("asyncssh", reason="no asyncssh here: pip install 'rtgs[cluster]'")
 pytestmark = pytest.mark.filterwarnings("ignore:coroutine 'Queue.join'")  # asyncssh's, at the end of a command

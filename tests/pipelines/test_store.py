@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from toy import ToyParams, broken, executions, graph, prep
 
-from rtgs.errors import RtgsError
-from rtgs.pipeline import InlineExecutor, Step, StepFailed, Store, make_plan
-from rtgs.pipeline.store import Artifact
+from rtgs.core.errors import RtgsError
+from rtgs.workflow import InlineExecutor, Step, StepFailed, Store, make_plan
+from rtgs.workflow.store import Artifact
 
 
 def run(root: Path, *targets: Step) -> Store:

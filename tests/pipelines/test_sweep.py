@@ -12,9 +12,9 @@ import pytest
 from omegaconf import OmegaConf
 from PIL import Image
 
-from pipelines.cli import main
-from pipelines.sweep import SweepStart
-from rtgs.pipeline import Store
+from pipelines.cli.main import main
+from pipelines.planning.sweep import SweepStart
+from rtgs.workflow import Store
 
 QUICK = (
     "method=2dgs",

@@ -13,17 +13,17 @@ import torch
 from PIL import Image
 from test_app import QUICK, _in_root, root  # noqa: F401  (fixtures)
 
-from pipelines.cli import main
-from pipelines.evaluate import TRACKED
-from pipelines.graph import RunGraph, build_graph
-from pipelines.train_transmittance import BOUNDARY_FILE
-from pipelines.training import OBJECT_FOLDER, load_method, stage_params
+from pipelines.cli.main import main
+from pipelines.planning.graph import RunGraph, build_graph
+from pipelines.steps.evaluate import TRACKED
+from pipelines.steps.train_transmittance import BOUNDARY_FILE
+from pipelines.steps.training import OBJECT_FOLDER, load_method, stage_params
 from rtgs.config import compose
 from rtgs.config.locate import conf_dir
 from rtgs.mesh.container import read_object_mesh
 from rtgs.methods.transmittance import TransmissiveMethod
-from rtgs.pipeline.manifest import Manifest
 from rtgs.scenes.canonical import read_scene
+from rtgs.workflow.manifest import Manifest
 
 WIDTH, HEIGHT, VIEWS = 32, 24, 14
 ROWS = ("none", "no_transmittance_gaussians", "no_specular_loss", "no_depth_loss", "no_mesh_guide")

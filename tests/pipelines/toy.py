@@ -12,7 +12,7 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from rtgs.pipeline import NOT_IN_RECIPE, InlineExecutor, Step, StepContext, Store, make_plan
+from rtgs.workflow import NOT_IN_RECIPE, InlineExecutor, Step, StepContext, Store, make_plan
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from rtgs.prepare import sfm
+from rtgs.prepare.poses import sfm
 from rtgs.prepare.settings import SfmSettings
 
 

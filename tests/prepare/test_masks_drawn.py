@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from rtgs.prepare.errors import PrepareError
-from rtgs.prepare.masks_drawn import drawn_kinds, read_drawing
-from rtgs.prepare.masks_grabcut import Marks, grab_cut
-from rtgs.prepare.masks_plane import fit_pane, pixel_rays, seen_from
-from rtgs.prepare.masks_settings import DrawnSettings
+from rtgs.prepare.masks.drawn import drawn_kinds, read_drawing
+from rtgs.prepare.masks.grabcut import Marks, grab_cut
+from rtgs.prepare.masks.plane import fit_pane, pixel_rays, seen_from
+from rtgs.prepare.masks.settings import DrawnSettings
 from rtgs.scenes.capture import CaptureView, PointCloud
-from rtgs.scenes.importers import read_capture
+from rtgs.scenes.importers.registry import read_capture
 from rtgs.scenes.scene import load_view
 from rtgs.scenes.settings import SceneSettings
 from rtgs.scenes.undistort import Lens, project

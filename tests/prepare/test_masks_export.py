@@ -16,10 +16,10 @@ transformers = pytest.importorskip("transformers")
 from transformers.models.grounding_dino import modeling_grounding_dino  # noqa: E402
 
 from rtgs.prepare.errors import PrepareError  # noqa: E402
-from rtgs.prepare.masks_detect import Box, Detector, PromptTokenizer, imagenet_batch, read_boxes  # noqa: E402
-from rtgs.prepare.masks_export import export, phrase_masks  # noqa: E402
-from rtgs.prepare.masks_segment import Segmenter  # noqa: E402
-from rtgs.prepare.masks_settings import DetectorSettings, SegmenterSettings  # noqa: E402
+from rtgs.prepare.masks.detect import Box, Detector, PromptTokenizer, imagenet_batch, read_boxes  # noqa: E402
+from rtgs.prepare.masks.onnx_export import export, phrase_masks  # noqa: E402
+from rtgs.prepare.masks.segment import Segmenter  # noqa: E402
+from rtgs.prepare.masks.settings import DetectorSettings, SegmenterSettings  # noqa: E402
 from rtgs.prepare.onnx import Network  # noqa: E402
 from tests.prepare import glass_scene  # noqa: E402
 from tests.prepare.glass_scene import SAM_SIDE  # noqa: E402

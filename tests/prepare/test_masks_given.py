@@ -10,8 +10,8 @@ import pytest
 from PIL import Image
 
 from rtgs.prepare.errors import PrepareError
-from rtgs.prepare.masks_given import given_files, mask_file, read_given
-from rtgs.prepare.masks_settings import GivenSettings
+from rtgs.prepare.masks.given import given_files, mask_file, read_given
+from rtgs.prepare.masks.settings import GivenSettings
 from rtgs.scenes.capture import CaptureView
 from rtgs.scenes.settings import CaptureError
 from rtgs.scenes.undistort import Lens

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rtgs.prepare.masks_hull import (
+from rtgs.prepare.masks.hull import (
     SmallMask,
     carve,
     common_hull,
@@ -16,8 +16,8 @@ from rtgs.prepare.masks_hull import (
     signed_distance,
     small_mask,
 )
-from rtgs.prepare.masks_plane import pixel_rays
-from rtgs.prepare.masks_settings import CleanSettings
+from rtgs.prepare.masks.plane import pixel_rays
+from rtgs.prepare.masks.settings import CleanSettings
 from rtgs.scenes.capture import CaptureView
 from rtgs.scenes.undistort import Lens
 from tests.prepare.glass_scene import CENTER, FOCAL, HEIGHT, RADIUS, WIDTH, ball_mask, overlap, poses

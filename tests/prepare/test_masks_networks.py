@@ -13,9 +13,9 @@ pytest.importorskip("onnxruntime")
 pytest.importorskip("tokenizers")
 
 from rtgs.prepare.errors import PrepareError
-from rtgs.prepare.masks_detect import Box, Detector, PromptTokenizer, Tokens, box_iou, read_boxes, suppress
-from rtgs.prepare.masks_segment import Segmenter
-from rtgs.prepare.masks_settings import DetectorSettings, SegmenterSettings
+from rtgs.prepare.masks.detect import Box, Detector, PromptTokenizer, Tokens, box_iou, read_boxes, suppress
+from rtgs.prepare.masks.segment import Segmenter
+from rtgs.prepare.masks.settings import DetectorSettings, SegmenterSettings
 from rtgs.prepare.onnx import Network
 from tests.prepare import glass_scene, tiny_networks
 from tests.prepare.glass_scene import GLASS, WORDS, overlap, shots

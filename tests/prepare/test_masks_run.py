@@ -16,12 +16,12 @@ pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
 pytest.importorskip("tokenizers")
 
-from pipelines.cli import main
+from pipelines.cli.main import main
 from rtgs.prepare.errors import PrepareError
-from rtgs.prepare.masks import MaskRequest, make_masks
-from rtgs.prepare.masks_makers import file_digest, find_networks
-from rtgs.prepare.masks_report import MaskReport
-from rtgs.prepare.masks_settings import (
+from rtgs.prepare.masks.make import MaskRequest, make_masks
+from rtgs.prepare.masks.makers import file_digest, find_networks
+from rtgs.prepare.masks.report import MaskReport
+from rtgs.prepare.masks.settings import (
     CleanSettings,
     DetectorSettings,
     DrawnSettings,
@@ -29,7 +29,7 @@ from rtgs.prepare.masks_settings import (
     MaskSettings,
     SegmenterSettings,
 )
-from rtgs.prepare.weights import REGISTRY, MissingWeights
+from rtgs.prepare.pretrained import REGISTRY, MissingWeights
 from rtgs.scenes.images import read_mask
 from rtgs.scenes.scene import load_scene
 from rtgs.scenes.settings import SceneSettings

@@ -13,11 +13,14 @@ pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
 pytest.importorskip("tokenizers")
 
-from rtgs.prepare import export, masks, masks_makers, normals, photos
-from rtgs.prepare.masks import MaskRequest, make_masks
-from rtgs.prepare.masks_settings import DetectorSettings, GivenSettings, MaskSettings
-from rtgs.prepare.normals import make_normals
-from rtgs.prepare.photos import lay_out, read_photo_set, write_ignored
+from rtgs.prepare.masks import make as masks
+from rtgs.prepare.masks import makers as masks_makers
+from rtgs.prepare.masks.make import MaskRequest, make_masks
+from rtgs.prepare.masks.settings import DetectorSettings, GivenSettings, MaskSettings
+from rtgs.prepare.normals import make as normals
+from rtgs.prepare.normals.make import make_normals
+from rtgs.prepare.poses import export, photos
+from rtgs.prepare.poses.photos import lay_out, read_photo_set, write_ignored
 from rtgs.prepare.settings import NormalSettings
 from rtgs.scenes.settings import SceneSettings
 from rtgs.scenes.undistort import Lens

@@ -15,11 +15,12 @@ from hypothesis import strategies as st
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
 
-from pipelines.cli import main  # noqa: E402
-from rtgs.prepare.adapters import ADAPTERS, NormalAdapter  # noqa: E402
+from pipelines.cli.main import main  # noqa: E402
 from rtgs.prepare.errors import PrepareError  # noqa: E402
-from rtgs.prepare.masks_makers import file_digest  # noqa: E402
-from rtgs.prepare.normal_maps import (  # noqa: E402
+from rtgs.prepare.masks.makers import file_digest  # noqa: E402
+from rtgs.prepare.normals.adapters import ADAPTERS, NormalAdapter  # noqa: E402
+from rtgs.prepare.normals.make import find_network, make_normals  # noqa: E402
+from rtgs.prepare.normals.maps import (  # noqa: E402
     SurfaceSample,
     canonical_normals,
     judge_axes,
@@ -27,11 +28,10 @@ from rtgs.prepare.normal_maps import (  # noqa: E402
     sample_surface,
     surface_normals,
 )
-from rtgs.prepare.normal_tiles import Tiling, cut, predict_tiled, ramps  # noqa: E402
-from rtgs.prepare.normals import find_network, make_normals  # noqa: E402
+from rtgs.prepare.normals.tiles import Tiling, cut, predict_tiled, ramps  # noqa: E402
 from rtgs.prepare.onnx import Network  # noqa: E402
+from rtgs.prepare.pretrained import REGISTRY, MissingWeights, WrongWeights  # noqa: E402
 from rtgs.prepare.settings import NormalSettings  # noqa: E402
-from rtgs.prepare.weights import REGISTRY, MissingWeights, WrongWeights  # noqa: E402
 from rtgs.scenes.images import read_normals, read_photo, unit_or_zero  # noqa: E402
 from rtgs.scenes.scene import load_scene  # noqa: E402
 from rtgs.scenes.settings import SceneSettings  # noqa: E402

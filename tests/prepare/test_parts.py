@@ -11,13 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from rtgs.prepare import pairs
-from rtgs.prepare.compare import compare_poses
 from rtgs.prepare.errors import PrepareError
-from rtgs.prepare.quality import Evidence, advise, azimuth_gap, groups_of
+from rtgs.prepare.poses import pairs
+from rtgs.prepare.poses.compare import compare_poses
+from rtgs.prepare.poses.quality import Evidence, advise, azimuth_gap, groups_of
+from rtgs.prepare.poses.world import choose_world, find_up
 from rtgs.prepare.settings import MatchingSettings, SfmSettings, VideoSettings, WorldSettings
 from rtgs.prepare.source import find_source, source_digest
-from rtgs.prepare.world import choose_world, find_up
 from rtgs.scenes.capture import CaptureView
 from rtgs.scenes.settings import CaptureError, SceneSettings
 from tests.prepare.room import look, walk, write_photos

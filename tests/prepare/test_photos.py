@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from rtgs.prepare import photos
 from rtgs.prepare.errors import PrepareError
-from rtgs.prepare.photos import lay_out, read_photo_set, write_ignored
-from rtgs.prepare.poses import check_count
+from rtgs.prepare.poses import photos
+from rtgs.prepare.poses.find import check_count
+from rtgs.prepare.poses.photos import lay_out, read_photo_set, write_ignored
 from rtgs.prepare.settings import SfmSettings
 
 ORIENTATION, MAKE, MODEL, EXIF, FOCAL_35MM = 0x0112, 0x010F, 0x0110, 0x8769, 0xA405

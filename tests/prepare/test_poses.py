@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from rtgs.prepare import sfm
-from rtgs.prepare.compare import compare_poses
 from rtgs.prepare.errors import PrepareError
-from rtgs.prepare.photos import lay_out, read_photo_set
-from rtgs.prepare.poses import Request, find_poses
-from rtgs.prepare.quality import SfmReport
+from rtgs.prepare.poses import sfm
+from rtgs.prepare.poses.compare import compare_poses
+from rtgs.prepare.poses.find import Request, find_poses
+from rtgs.prepare.poses.photos import lay_out, read_photo_set
+from rtgs.prepare.poses.quality import SfmReport
 from rtgs.prepare.settings import FeatureSettings, MappingSettings, MatchingSettings, SfmSettings
 from rtgs.scenes.capture import CaptureView
-from rtgs.scenes.importers import read_capture
+from rtgs.scenes.importers.registry import read_capture
 from rtgs.scenes.scene import load_scene
 from rtgs.scenes.settings import SceneSettings
 from rtgs.scenes.undistort import Lens

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rtgs.prepare.compare import compare_poses
-from rtgs.prepare.poses import Request, find_poses
+from rtgs.prepare.poses.compare import compare_poses
+from rtgs.prepare.poses.find import Request, find_poses
 from rtgs.prepare.settings import FeatureSettings, SfmSettings
-from rtgs.scenes.importers import read_capture
+from rtgs.scenes.importers.registry import read_capture
 from rtgs.scenes.settings import SceneSettings
 
 DATA = Path(os.environ.get("RTGS_SHARED", Path(__file__).resolve().parents[3] / "shared")) / "data"

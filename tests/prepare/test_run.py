@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipelines.cli import main
+from pipelines.cli.main import main
 from tests.prepare.room import HEIGHT, WIDTH, walk, write_photos
 
 QUICK = (

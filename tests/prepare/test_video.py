@@ -11,9 +11,9 @@ import pytest
 from PIL import Image
 
 from rtgs.prepare.errors import PrepareError
+from rtgs.prepare.poses.video import Candidate, look_at_frames, select_frames, shift_between, write_frames
 from rtgs.prepare.progress import Ticker
 from rtgs.prepare.settings import VideoSettings
-from rtgs.prepare.video import Candidate, look_at_frames, select_frames, shift_between, write_frames
 from tests.prepare.room import photo, walk
 
 av = pytest.importorskip("av")

@@ -8,7 +8,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from rtgs.prepare.adapters import NormalAdapter
+from rtgs.prepare.normals.adapters import NormalAdapter
 
 
 def save(path: Path, nodes, inputs, outputs, constants: dict[str, np.ndarray]) -> Path:

@@ -9,9 +9,9 @@ from functools import cache
 import numpy as np
 import torch
 
-from rtgs.render import reference_ellipsoids
 from rtgs.render.buffers import EllipsoidBuffers, EllipsoidOptions
-from rtgs.render.discontinuities_ellipsoids import ellipsoid_discontinuity_mask
+from rtgs.render.discontinuities.ellipsoids import ellipsoid_discontinuity_mask
+from rtgs.render.reference import ellipsoids as reference_ellipsoids
 
 from .scenes import output, surfel
 from .strategies import NAMES, Recipe, SurfelScene, SurfelTensors, build, wild

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.render.buffers import RasterBuffers, RasterOptions
-from rtgs.render.rasterize import rasterize_surfels
+from rtgs.render.surfels import rasterize_surfels
 
 SCENE_OPTIONS = RasterOptions(depth=True, median_depth=True, normal=True, distortion=True, weight_sum=True)
 PICTURES = ("features", "alpha", "depth", "median_depth", "normal", "distortion")

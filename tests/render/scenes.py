@@ -7,9 +7,9 @@ from dataclasses import fields, replace
 import torch
 from torch import Tensor
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.render.buffers import EllipsoidBuffers, RasterBuffers, RasterOptions
-from rtgs.render.reference import rasterize_surfels
+from rtgs.render.reference.surfels import rasterize_surfels
 
 from .strategies import SurfelTensors
 

@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.render.buffers import RasterOptions
-from rtgs.render.discontinuities import DiscontinuityBands, discontinuity_mask
+from rtgs.render.discontinuities.surfels import DiscontinuityBands, discontinuity_mask
 
 from .scenes import ALL_OUTPUTS, identity_camera, join, surfel
 from .strategies import Recipe, SurfelTensors, build

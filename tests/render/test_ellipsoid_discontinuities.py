@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import pytest
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.render.buffers import EllipsoidOptions
-from rtgs.render.discontinuities_ellipsoids import ellipsoid_discontinuity_mask
+from rtgs.render.discontinuities.ellipsoids import ellipsoid_discontinuity_mask
 
 from .ellipsoid_runs import ANTIALIASED, PLAIN, ellipsoid
 from .scenes import identity_camera, join

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.native import core
 from rtgs.render.buffers import EllipsoidOptions
 from rtgs.render.ellipsoids import rasterize_ellipsoids

@@ -6,11 +6,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from rtgs.cameras import Camera
-from rtgs.render import reference
+from rtgs.core.cameras import Camera
 from rtgs.render.buffers import EllipsoidBuffers, EllipsoidOptions
-from rtgs.render.discontinuities_ellipsoids import ellipsoid_discontinuity_mask
-from rtgs.render.reference_ellipsoids import rasterize_ellipsoids
+from rtgs.render.discontinuities.ellipsoids import ellipsoid_discontinuity_mask
+from rtgs.render.reference import surfels as reference
+from rtgs.render.reference.ellipsoids import rasterize_ellipsoids
 
 from .ellipsoid_runs import ANTIALIASED, PICTURES, PLAIN, build_ellipsoids, ellipsoid, wild_ellipsoids
 from .scenes import identity_camera, join, output

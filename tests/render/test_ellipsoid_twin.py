@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from rtgs.render.buffers import EllipsoidOptions
 from rtgs.render.ellipsoids import rasterize_ellipsoids
-from rtgs.render.reference_ellipsoids import rasterize_ellipsoids as twin
+from rtgs.render.reference.ellipsoids import rasterize_ellipsoids as twin
 
 from .comparison import relative_error
 from .ellipsoid_runs import ANTIALIASED, PICTURES, PLAIN, expected, rounded, run, wild_ellipsoids

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.gaussians.ellipsoids import Ellipsoids
 from rtgs.gaussians.surfels import Surfels
 from rtgs.render.orbit import Orbit, Picture, orbit_cameras, orbit_of_cameras, orbit_of_gaussians, weighted_quantile

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from rtgs.native import core
 from rtgs.render.buffers import RasterOptions
-from rtgs.render.rasterize import rasterize_surfels
+from rtgs.render.surfels import rasterize_surfels
 
 from .native_scene import PICTURES, SCENE_OPTIONS, NativeScene, native_scene
 

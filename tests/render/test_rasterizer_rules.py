@@ -11,10 +11,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.render.buffers import RasterOptions
-from rtgs.render.rasterize import rasterize_surfels
-from rtgs.render.reference import rasterize_surfels as twin
+from rtgs.render.reference.surfels import rasterize_surfels as twin
+from rtgs.render.surfels import rasterize_surfels
 
 from .comparison import pixel_error, relative_error
 from .scenes import ALL_OUTPUTS, OUTPUTS, identity_camera, join, output, surfel

@@ -12,7 +12,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 
-from rtgs.render.rasterize import rasterize_surfels
+from rtgs.render.surfels import rasterize_surfels
 
 from .scenes import ALL_OUTPUTS
 from .strategies import DEGENERATE, Recipe, build, recipes

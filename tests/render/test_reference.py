@@ -6,10 +6,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from rtgs.cameras import Camera
-from rtgs.render import reference
+from rtgs.core.cameras import Camera
 from rtgs.render.buffers import RasterOptions
-from rtgs.render.reference import rasterize_surfels
+from rtgs.render.reference import surfels as reference
+from rtgs.render.reference.surfels import rasterize_surfels
 
 from .scenes import ALL_OUTPUTS, OUTPUTS, identity_camera, join, output, render, surfel, with_rows
 from .strategies import Recipe, SurfelTensors, build, wild

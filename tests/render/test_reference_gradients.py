@@ -11,9 +11,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from rtgs.cameras import Camera
-from rtgs.render.discontinuities import discontinuity_mask
-from rtgs.render.reference import attach_probe, rasterize_surfels
+from rtgs.core.cameras import Camera
+from rtgs.render.discontinuities.surfels import discontinuity_mask
+from rtgs.render.reference.surfels import attach_probe, rasterize_surfels
 
 from .scenes import ALL_OUTPUTS, OUTPUTS, join, output, render, surfel
 from .strategies import NAMES, SurfelTensors

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.methods.traced_pixels import tile_order
 from rtgs.render.trace import trace_surfels
 

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from rtgs.render.trace_discontinuities import TraceBands, fragile_rays
+from rtgs.render.discontinuities.trace import TraceBands, fragile_rays
 
 from .strategies import Recipe
 from .trace_runs import trace_scene

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from rtgs.native import core
-from rtgs.render import reference_trace
 from rtgs.render.buffers import TraceOptions
+from rtgs.render.reference import trace as reference_trace
 from rtgs.render.trace import SurfelTree, trace_surfels
 
 from .trace_runs import TraceScene, answer, run_trace

@@ -9,10 +9,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from rtgs.cameras import Camera
-from rtgs.render import reference, reference_trace
+from rtgs.core.cameras import Camera
 from rtgs.render.buffers import RasterOptions, TraceOptions
-from rtgs.render.rasterize import rasterize_surfels
+from rtgs.render.reference import surfels as reference
+from rtgs.render.reference import trace as reference_trace
+from rtgs.render.surfels import rasterize_surfels
 from rtgs.render.trace import trace_surfels
 
 RASTER_OPTIONS = RasterOptions(depth=True, normal=True, weight_sum=True)

@@ -8,7 +8,7 @@ import torch
 
 from rtgs.gaussians.harmonics import evaluate_sh
 from rtgs.render.buffers import TraceOptions
-from rtgs.render.reference_trace import trace_surfels
+from rtgs.render.reference.trace import trace_surfels
 
 from .trace_scenes import NAMES, OUTPUTS, TraceTensors, all_outputs, join, output, surfel, trace, with_rays
 
@@ -186,7 +186,7 @@ def test_chunks_do_not_change_the_result(monkeypatch: pytest.MonkeyPatch):
         return [*(output(buffers, n) for n in (*OUTPUTS, "weight_sum")), *torch.autograd.grad(loss, leaves.all())]
 
     whole = everything()
-    monkeypatch.setattr("rtgs.render.reference_trace.PAIRS_PER_CHUNK", 6)
+    monkeypatch.setattr("rtgs.render.reference.trace.PAIRS_PER_CHUNK", 6)
     for name, a, b in zip((*OUTPUTS, "weight_sum", *NAMES), whole, everything(), strict=True):
         torch.testing.assert_close(a, b, msg=name)
 

@@ -10,8 +10,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from rtgs.render.reference_trace import trace_surfels
-from rtgs.render.trace_discontinuities import fragile_rays
+from rtgs.render.discontinuities.trace import fragile_rays
+from rtgs.render.reference.trace import trace_surfels
 
 from .trace_scenes import NAMES, OUTPUTS, TraceTensors, all_outputs, join, output, surfel, trace, with_rays
 
@@ -119,7 +119,7 @@ def test_the_probe_does_not_move_anything():
 
 
 def test_last_sh_leaves_the_direction_only_the_last_colours_term():
-    """methods.md 0 item 6: the geometric term and all but the last contributor's SH term are lost; nothing else is."""
+    """method.md 0 item 6: the geometric term and all but the last contributor's SH term are lost; nothing else is."""
     scene = smooth_scene().rays(torch.tensor([0]))
     names = tuple(name for name in NAMES if name != "directions")
     for full, last in zip(

@@ -14,10 +14,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rtgs.cameras import Camera
-from rtgs.render import reference_trace
+from rtgs.core.cameras import Camera
 from rtgs.render.buffers import TraceBuffers, TraceOptions
-from rtgs.render.trace_discontinuities import fragile_rays
+from rtgs.render.discontinuities.trace import fragile_rays
+from rtgs.render.reference import trace as reference_trace
 
 from .comparison import ErrorPool, relative_error
 from .strategies import Recipe, SurfelTensors, build

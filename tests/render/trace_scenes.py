@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from rtgs.render.buffers import TraceBuffers, TraceOptions
-from rtgs.render.reference_trace import trace_surfels
+from rtgs.render.reference.trace import trace_surfels
 
 OUTPUTS = ("colors", "features", "alpha", "depth", "normal")
 

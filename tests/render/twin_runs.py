@@ -9,9 +9,9 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from rtgs.render import reference
 from rtgs.render.buffers import RasterBuffers, RasterOptions
-from rtgs.render.discontinuities import discontinuity_mask
+from rtgs.render.discontinuities.surfels import discontinuity_mask
+from rtgs.render.reference import surfels as reference
 
 from .comparison import ErrorPool, pixel_error, relative_error
 from .scenes import ALL_OUTPUTS, OUTPUTS, output

@@ -2,7 +2,7 @@
 
 import torch
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.report.layers import layer_pixels
 from rtgs.scenes.truth import ViewTruth
 

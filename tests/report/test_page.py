@@ -14,7 +14,7 @@ import pytest
 import torch
 from PIL import Image
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.evaluate.records import METRICS, EvaluationTable, RunFacts, ViewScore
 from rtgs.mesh.triangles import TriangleMesh
 from rtgs.report.figures import Curve, curve_svg, depth_picture, image_bytes, mesh_picture, normal_picture, outlined

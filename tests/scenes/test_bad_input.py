@@ -208,5 +208,5 @@ def test_unknown_embedded_capture():
 
 
 def test_a_described_scene_that_is_not_shipped_says_how_to_make_it(monkeypatch):
-    monkeypatch.setattr("rtgs.scenes.embedded.embedded_names", lambda: ("other",))
+    monkeypatch.setattr("rtgs.scenes.importers.embedded.embedded_names", lambda: ("other",))
     refused("embedded:tall_bottle", "rtgs run synthesize scene=tall_bottle")

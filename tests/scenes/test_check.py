@@ -8,7 +8,7 @@ import re
 import numpy as np
 
 from rtgs.scenes.check import check_capture, seen_share
-from rtgs.scenes.colmap import read_colmap
+from rtgs.scenes.importers.colmap import read_colmap
 from rtgs.scenes.scene import load_scene
 from rtgs.scenes.settings import SceneSettings
 

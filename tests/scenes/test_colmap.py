@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 from rtgs.scenes.capture import CaptureError
-from rtgs.scenes.colmap import find_images, read_colmap
+from rtgs.scenes.importers.colmap import find_images, read_colmap
 from rtgs.scenes.scene import load_scene
 from rtgs.scenes.settings import SceneSettings
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.scenes.contact_sheet import COLUMNS, cells, contact_sheet
 from rtgs.scenes.scene import View
 from rtgs.scenes.settings import CaptureError

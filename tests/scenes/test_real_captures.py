@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from rtgs.scenes.check import check_capture
-from rtgs.scenes.colmap import read_colmap
+from rtgs.scenes.importers.colmap import read_colmap
+from rtgs.scenes.importers.transforms import read_transforms
 from rtgs.scenes.scene import load_scene
 from rtgs.scenes.settings import SceneSettings
 from rtgs.scenes.splits import choose_split
-from rtgs.scenes.transforms import read_transforms
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 DATA = Path(os.environ.get("RTGS_SHARED", REPOSITORY.parent / "shared")) / "data"

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from test_track import INFO, log_everything
 
-from rtgs.errors import RtgsError
+from rtgs.core.errors import RtgsError
 from rtgs.track import RunInfo, open_tracking
 from rtgs.track.mlflow import MlflowTracking
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rtgs.errors import RtgsError
+from rtgs.core.errors import RtgsError
 from rtgs.track import NullTracking, RunInfo, Tracker, open_tracking
 from rtgs.track.jsonl import safe_name
 from rtgs.track.protocol import as_uint8

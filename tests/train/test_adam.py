@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
+from rtgs.gaussians.adam import NonFiniteGradientError, SurfelAdam, find_nonfinite
 from rtgs.gaussians.surfels import Surfels
-from rtgs.train.adam import NonFiniteGradientError, SurfelAdam, find_nonfinite
 from rtgs.train.settings import OptimizerSettings
 
 SETTINGS = OptimizerSettings()

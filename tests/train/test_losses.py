@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from skimage.metrics import structural_similarity
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.native import core
 from rtgs.train import losses, reference_losses
 

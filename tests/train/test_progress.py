@@ -8,9 +8,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from rtgs.pipeline.engine import worker_environment
 from rtgs.train import progress
 from rtgs.train.progress import BarProgress, LineProgress, SilentProgress, StepReport, progress_for
+from rtgs.workflow.engine import worker_environment
 
 
 class Terminal(io.StringIO):

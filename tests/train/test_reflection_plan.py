@@ -53,7 +53,7 @@ def test_the_papers_boundaries():
 
 
 def test_the_papers_third_stage_has_a_clock_of_its_own_and_freezes_the_base():
-    """methods.md 6.2: from 20,000 of 60,000; the base set's density control and resets end there."""
+    """method.md 6.2: from 20,000 of 60,000; the base set's density control and resets end there."""
     config, _ = compose(["scene=demo", "method=rtgs", "preset=paper", "schedule.densify_until=30000"])
     settings, schedule, loss = config.method.transmittance, config.schedule, config.method.loss
     plan = transmittance_plan(settings, schedule)

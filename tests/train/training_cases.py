@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.methods import create_method
 from rtgs.scenes.scene import Scene, View
 from rtgs.train.seeds import generator_for

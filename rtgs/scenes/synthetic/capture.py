@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.scenes.synthetic.assemble import SPECULAR, TRANSPARENT
 from rtgs.scenes.synthetic.colmap_text import write_colmap_text
 from rtgs.scenes.synthetic.description import SceneDescription

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 
 
 def write_colmap_text(

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.scenes.synthetic.description import Shape
 from rtgs.scenes.synthetic.geometry import sample_surface
 from rtgs.scenes.synthetic.render import Geometry, PathTracer

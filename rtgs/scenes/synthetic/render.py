@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.scenes.synthetic.assemble import scene_of
 from rtgs.scenes.synthetic.description import SceneDescription
 from rtgs.scenes.synthetic.geometry import Mesh, build

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from rtgs.errors import RtgsError
+from rtgs.core.errors import RtgsError
 
 TRUTHS = ("all", "test", "none")
 _LARGEST_SIDE = 8192
@@ -41,7 +41,7 @@ class CaptureSettings:
     test_samples: int = 256
     """Paths a pixel of test views, rendered as two halves that measure their noise."""
     test_every: int = 8
-    """Views whose index is divisible by it are test views, as the importer splits them (methods.md 8.1)."""
+    """Views whose index is divisible by it are test views, as the importer splits them (method.md 8.1)."""
     truth: str = "all"
     """Which views get a truth/ folder: ``all``, ``test`` or ``none``."""
     jpeg_quality: int = 95

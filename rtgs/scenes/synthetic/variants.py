@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from rtgs.errors import RtgsError
+from rtgs.core.errors import RtgsError
 
 LLVM_VARIANT, SCALAR_VARIANT = "llvm_ad_rgb", "scalar_rgb"
 

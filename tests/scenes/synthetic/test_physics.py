@@ -6,7 +6,7 @@ import torch
 
 pytest.importorskip("mitsuba", reason="path tracing needs the extra 'synthetic'")
 
-from rtgs.cameras import Camera
+from rtgs.core.cameras import Camera
 from rtgs.scenes.synthetic.capture import to_srgb
 from rtgs.scenes.synthetic.description import Material, SceneDescription, Shape, Viewpoints
 from rtgs.scenes.synthetic.render import PathTracer

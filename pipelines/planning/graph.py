@@ -1,0 +1,191 @@
+"""The graph of a run: (sfm, masks, normals ->) import -> one step per stage (+ mesh) -> render, evaluate, report.
+
+Pure: from a config to steps with parameters; nothing runs here. Each step is given only what it reads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+
+from pipelines.planning.mask_plan import draws_panes
+from pipelines.planning.preparation import Preparation, SkippedStep, prepare
+from pipelines.planning.transparent import Transparency, find_transparency
+from pipelines.steps import (
+    evaluate,
+    extract_mesh,
+    import_scene,
+    masks,
+    normals,
+    render,
+    report,
+    sfm,
+    synthesize,
+    train_diffuse,
+    train_reflection,
+    train_transmittance,
+)
+from pipelines.steps.training import StageParams
+from rtgs.config.schema import Choices, RunConfig
+from rtgs.methods import has_third_stage, method_stages, stage_settings
+from rtgs.train.settings import MethodSettings, ScheduleSettings
+from rtgs.workflow import Step, StepKind
+from rtgs.workflow.fingerprint import flatten
+
+TRAINING: Mapping[str, StepKind] = {
+    "diffuse": train_diffuse.STEP,
+    "reflection": train_reflection.STEP,
+    "transmittance": train_transmittance.STEP,
+}
+"""The step that runs a stage, by the name the method gives it."""
+
+KINDS: tuple[StepKind, ...] = (
+    sfm.STEP,
+    masks.STEP,
+    normals.STEP,
+    import_scene.STEP,
+    *TRAINING.values(),
+    extract_mesh.STEP,
+    render.STEP,
+    evaluate.STEP,
+    report.STEP,
+    synthesize.STEP,
+)
+"""Every kind of step there is; the guard against forgotten version bumps goes through them."""
+
+_NOT_SHOWN = ("paths.", "tracking.", "table.", "name", "threads", "scene.path", "method.paper_schedule.")
+
+
+@dataclass(frozen=True)
+class RunGraph:
+    """The steps of one run by what they give."""
+
+    scene: Step
+    training: tuple[Step, ...]
+    render: Step
+    evaluate: Step
+    report: Step
+    mesh: Step | None = None
+    skipped: tuple[SkippedStep, ...] = ()
+
+    @property
+    def targets(self) -> tuple[Step, ...]:
+        """What a run asks for; everything else is upstream of it."""
+        return (self.report,)
+
+
+def build_graph(config: RunConfig, choices: Choices) -> RunGraph:
+    """The steps of ``rtgs run`` for this config. Reads the capture's poses and hashes its files, runs nothing.
+
+    Raises:
+        CaptureError: the capture cannot be read.
+        ValueError: no method of this name.
+    """
+    config = _as_asked(config)
+    prepared = prepare(config)
+    scene = prepared.scene
+    transparency = find_transparency(config, prepared)
+    training, object_mesh = _training(config, prepared, transparency.present)
+    rendered = render.STEP.step(render.RenderParams(), scene, *training)
+    measured = evaluate.STEP.step(
+        evaluate.EvaluateParams(config.evaluation, method_label(choices), choices.preset),
+        scene,
+        *training,
+        *(() if object_mesh is None else (object_mesh,)),
+        rendered,
+        tools=_pretrained() if config.evaluation.lpips else (),
+    )
+    skipped = (*prepared.skipped, *_left_out(config, transparency, object_mesh))
+    mesh = object_mesh
+    if mesh is None and config.mesh.extract:
+        mesh = extract_mesh.STEP.step(_mesh_params(config), scene, *training)
+    made = (rendered, measured) if mesh is None else (mesh, rendered, measured)
+    params = _report_params(config, choices, skipped)
+    page = report.STEP.step(params, *prepared.steps, scene, *training, *made)
+    return RunGraph(scene, training, rendered, measured, page, mesh, skipped)
+
+
+def _as_asked(config: RunConfig) -> RunConfig:
+    """``masks=none``: not those that the capture brings either."""
+    if config.masks.source != "none":
+        return config
+    return replace(config, scene=replace(config.scene, masks_dir=""))
+
+
+def _left_out(config: RunConfig, transparency: Transparency, object_mesh: Step | None) -> tuple[SkippedStep, ...]:
+    """What a run of a method with a third stage does without, and why."""
+    if object_mesh is None:
+        late = "method.transmittance.start leaves it no step"
+        why = late if transparency.present else transparency.why
+        return (SkippedStep("train_transmittance", why),) if config.method.name == "rtgs" else ()
+    if config.mesh.extract:
+        return (
+            SkippedStep("scene mesh", "extract_mesh makes the transparent object's mesh, which the third stage needs"),
+        )
+    return ()
+
+
+def _training(config: RunConfig, prepared: Preparation, transparent: bool) -> tuple[tuple[Step, ...], Step | None]:
+    """One training step per stage, and the object mesh that a third one builds on."""
+    scene = prepared.scene
+    method: MethodSettings = replace(config.method, paper_schedule=ScheduleSettings())  # a preset has read it by now
+    steps: list[Step] = []
+    object_mesh = None
+    for stage in method_stages(method, config.schedule, transparent=transparent):
+        own = stage_settings(method, stage.name)  # so that runs that differ elsewhere share the stage
+        params = StageParams(own, config.schedule, config.seed, stage.name, stage.from_step, stage.until)
+        if stage.name == "transmittance":
+            read = (*(step for step in prepared.steps if draws_panes(step)), scene, *steps)
+            object_mesh = extract_mesh.STEP.step(extract_mesh.object_params(config), *read)
+            steps.append(TRAINING[stage.name].step(params, scene, *steps, object_mesh))
+        else:
+            steps.append(TRAINING[stage.name].step(params, scene, *steps))
+    return tuple(steps), object_mesh
+
+
+def _mesh_params(config: RunConfig) -> extract_mesh.ExtractMeshParams:
+    mesh = config.mesh
+    return extract_mesh.ExtractMeshParams(mesh.tsdf, mesh.only_masked, mesh.depth_ratio, mesh.obj)
+
+
+def _pretrained() -> tuple[tuple[str, str], ...]:
+    """Which pretrained files LPIPS would find: the table changes when they arrive."""
+    from rtgs.pretrained.weights import REGISTRY, MissingWeights, find_weights
+
+    found = []
+    for name, file in sorted(REGISTRY.items()):
+        try:
+            find_weights(file)
+            found.append((name, file.sha256))
+        except MissingWeights:
+            found.append((name, "absent"))
+    return tuple(found)
+
+
+def method_label(choices: Choices) -> str:
+    """The method's name in tables; an ablation is part of it."""
+    return choices.method if choices.ablation in ("", "none") else f"{choices.method}, {choices.ablation}"
+
+
+def _report_params(config: RunConfig, choices: Choices, skipped: tuple[SkippedStep, ...]) -> report.ReportParams:
+    values, defaults = shown_values(config), shown_values(RunConfig())
+    lines = {key: (str(values[key]), str(defaults.get(key, ""))) for key in sorted(values)}
+    title = f"{config.scene.name}: {method_label(choices)}, {choices.preset}"
+    decisions = tuple((f"no {step.name} step", step.why) for step in skipped)
+    return report.ReportParams(title, command(choices), lines, decisions)
+
+
+def shown_values(config: RunConfig) -> dict[str, object]:
+    """Every value that has to do with the result, by dotted key."""
+    meshed = config.mesh.extract or has_third_stage(config.method)
+    hidden = _NOT_SHOWN if meshed else (*_NOT_SHOWN, "mesh.")
+    return {key: value for key, value in flatten(asdict(config)).items() if not key.startswith(hidden)}
+
+
+def command(choices: Choices) -> str:
+    """The command line that repeats a run."""
+    groups = {"scene": choices.scene_file, "method": choices.method, "preset": choices.preset}
+    words = [f"{group}={name}" for group, name in groups.items() if name]
+    words += [f"ablation={choices.ablation}"] if choices.ablation not in ("", "none") else []
+    words += [f"experiment={choices.experiment}"] if choices.experiment else []
+    return " ".join(["rtgs run", *words, *choices.overrides])

@@ -1,0 +1,165 @@
+"""A sweep as one plan: the steps of all jobs merged, so that what jobs share runs once."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig
+
+from pipelines.planning.plan import Job, describe, merge_jobs, remote_store
+from rtgs.config.schema import RunConfig
+from rtgs.core.errors import RtgsError
+from rtgs.track import RunInfo
+from rtgs.track.source import git_tags
+from rtgs.workflow import RemoteStore, Step, Store, SweepOutcomes, make_plan, topological
+from rtgs.workflow.engine import DaskExecutor, EngineSettings, WorkerJob, open_client
+
+log = logging.getLogger("rtgs")
+_HERE = ("BasicLauncher", "RtgsDaskLauncher")  # run jobs in the process that starts the sweep
+_PREPARED: ContextVar[SweepOutcomes | None] = ContextVar("prepared sweep", default=None)
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """What the jobs of one ``--multirun`` have in common."""
+
+    id: str  # of this invocation: the name of its folder of logs
+    name: str
+    folder: Path
+    elsewhere: bool = False  # its jobs run in processes of their own
+
+    def group(self, experiment: str) -> RunInfo:
+        """The run that holds the jobs together in the tracker."""
+        return RunInfo(experiment, self.name, f"sweep {self.id}", {"rtgs.sweep": self.id, **git_tags()})
+
+    def leave_error(self, number: int, error: Exception) -> None:
+        """In a job: what stopped it. Launchers with processes of their own bring only the first error back."""
+        self._error_file(number).write_text(f"{error}\n", encoding="utf-8")
+
+    def error_of(self, number: int) -> str:
+        """What stopped a job; empty where it left no error."""
+        file = self._error_file(number)
+        return file.read_text(encoding="utf-8").strip() if file.is_file() else ""
+
+    def _error_file(self, number: int) -> Path:
+        return self.folder / f"error_{number}.txt"
+
+
+class SweepStart(Callback):
+    """Keeps what a sweep is in the process that starts it, whatever launcher runs the jobs (``conf/config.yaml``)."""
+
+    sweep: ClassVar[Sweep | None] = None
+
+    def on_multirun_start(self, config: DictConfig, **_: object) -> None:
+        """Hydra calls this before any job."""
+        SweepStart.sweep = _sweep(config.hydra)
+        for left in SweepStart.sweep.folder.glob("error_*.txt"):  # of another sweep that was given this folder
+            left.unlink(missing_ok=True)
+
+
+def current_sweep() -> Sweep | None:
+    """The sweep that the running job belongs to; None outside of Hydra or of a sweep."""
+    from hydra.core.hydra_config import HydraConfig
+    from hydra.types import RunMode
+
+    if not HydraConfig.initialized() or (hydra := HydraConfig.get()).mode != RunMode.MULTIRUN:
+        return None
+    return _sweep(hydra)
+
+
+def _sweep(hydra: Any) -> Sweep:
+    folder = Path(str(hydra.sweep.dir)).absolute()
+    identity = f"{folder.parent.name}_{folder.name}"
+    experiment = hydra.runtime.choices.get("experiment")
+    elsewhere = not str(hydra.launcher.get("_target_")).endswith(_HERE)
+    return Sweep(identity, f"{experiment or 'sweep'} {identity}", folder, elsewhere)
+
+
+def run_merged(jobs: Sequence[Job], settings: EngineSettings) -> SweepOutcomes:
+    """Bring the steps of all jobs into the store, each once; a job whose graph cannot be built is left to fail alone.
+
+    Raises:
+        RtgsError: the cluster does not start, what it made is not to be found here, or the jobs disagree about where
+            the store is.
+    """
+    merged = merge_jobs(jobs)
+    for title, problem in merged.problems:
+        log.debug("%s is left out of the merged plan: %s", title, problem)  # the job itself stops with it
+    if not merged.targets:
+        return SweepOutcomes({})
+    config = _common(jobs)
+    store = Store(config.paths.store)
+    plan = make_plan(merged.targets, store, remote_store(config))
+    log.info("%d jobs, %s", len(jobs), describe(plan))
+    if plan.complete:
+        return SweepOutcomes({})
+    with open_client(settings) as client:
+        outcomes = DaskExecutor(client, _worker_job(config, settings)).attempt(plan)
+    check_arrived(merged.targets, outcomes, store, remote_store(config))
+    return replace(outcomes, planned={planned.step.fingerprint: planned for planned in plan})
+
+
+def check_arrived(
+    targets: Sequence[Step], outcomes: SweepOutcomes, store: Store, remote: RemoteStore | None, patience: float = 10.0
+) -> None:
+    """Workers with a disk of their own must not lead to everything being run again, here, by the jobs.
+
+    Raises:
+        RtgsError: a step that a worker finished is neither in ``store`` nor in the remote one, after ``patience``
+            seconds in which a network disk may show it.
+    """
+    until = time.monotonic() + patience
+    for step in topological(targets):  # jobs look for what their results were made of, too
+        outcome = outcomes.outcomes[step.fingerprint]
+        while not outcome.failed and store.find(step) is None:
+            if remote is not None and remote.manifest(step.name, step.fingerprint) is not None:
+                break
+            if time.monotonic() > until:
+                raise RtgsError(
+                    f"{step.label} is finished in {outcome.folder} of a worker, which is not in {store.root} here: let "
+                    "the machines share paths.root, or a store (paths.remote)"
+                )
+            time.sleep(0.2)
+
+
+def _common(jobs: Sequence[Job]) -> RunConfig:
+    first = jobs[0].config
+    for job in jobs:
+        if (job.config.paths, job.config.tracking) != (first.paths, first.tracking):
+            raise RtgsError("a merged sweep has one store and one tracker: do not sweep over paths or tracking")
+    return first
+
+
+def _worker_job(config: RunConfig, settings: EngineSettings) -> WorkerJob:
+    tracking = config.tracking
+    return WorkerJob(
+        str(config.paths.store),
+        settings.worker_threads,
+        config.paths.remote,
+        tracking.kind,
+        str(Path(config.paths.root)),
+        tracking.uri,
+    )
+
+
+@contextmanager
+def prepared(outcomes: SweepOutcomes) -> Iterator[None]:
+    """Jobs run inside read what the merged plan brought, and stop with the error of the step that failed."""
+    token = _PREPARED.set(outcomes)
+    try:
+        yield
+    finally:
+        _PREPARED.reset(token)
+
+
+def prepared_outcomes() -> SweepOutcomes:
+    """The outcomes of the merged plan this job belongs to; empty outside of one."""
+    return _PREPARED.get() or SweepOutcomes({})

@@ -1,0 +1,331 @@
+"""The run folder and the tracked run: what people look at, copied out of the store."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+from filelock import FileLock
+
+from pipelines.steps.evaluate import TABLE_CSV, TABLE_JSON
+from pipelines.steps.pictures import final_pictures, training_pictures
+from pipelines.steps.report import PAGE
+from pipelines.steps.training import read_history, stage_params
+from rtgs.config.schema import Choices, RunConfig
+from rtgs.core.errors import RtgsError
+from rtgs.core.listing import columns
+from rtgs.evaluate.records import METRICS, EvaluationTable, read_json
+from rtgs.prepare.masks.report import FILES as MASK_FILES
+from rtgs.prepare.poses.quality import PICTURE_FILE, REPORT_FILE
+from rtgs.track import RunInfo, Tracker
+from rtgs.track.source import git_tags, installed
+from rtgs.workflow import Plan, StepResult, Store
+
+if TYPE_CHECKING:
+    from pipelines.planning.preparation import SkippedStep
+
+RUN_FILE = "run.json"
+CONFIG_FILE = "config.yaml"
+INSTALLED_FILE = "requirements.txt"
+_TRACKED_IMAGES = 4
+_NOT_TOLD = ("paths.", "tracking.", "table.")  # where results go, not what they are
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """``run.json`` of a run folder."""
+
+    name: str
+    command: str
+    finished: str  # UTC, ISO 8601
+    choices: dict[str, Any]
+    steps: dict[str, str]  # fingerprint by step name
+    tracked: tuple[str, ...] = ()  # places that hold a record of this run with these steps
+
+    @staticmethod
+    def read(folder: Path) -> RunRecord | None:
+        """The record of a run folder, or None where there is none."""
+        with suppress(OSError, ValueError, TypeError):
+            record = RunRecord(**json.loads((folder / RUN_FILE).read_text(encoding="utf-8")))
+            return replace(record, tracked=tuple(record.tracked))
+        return None
+
+
+def note_tracked(folder: Path, results: Sequence[StepResult], place: str) -> None:
+    """Write into the record of a run folder that the tracker at ``place`` has this run, unless another run of that name
+    has the folder by now."""
+    steps = _keys(results)
+    with _folder_lock(folder):
+        record = RunRecord.read(folder)
+        if record is not None and record.steps == steps and place not in record.tracked:
+            _write_record(folder, replace(record, tracked=(*record.tracked, place)))
+
+
+def is_tracked(config: RunConfig, plan: Plan, place: str) -> bool:
+    """Whether the tracker at ``place`` has the run of this name with these steps, by the record of its folder."""
+    record = RunRecord.read(config.paths.runs / str(config.name))
+    steps = {planned.step.name: planned.step.fingerprint for planned in plan}
+    return record is not None and record.steps == steps and place in record.tracked
+
+
+def _write_record(folder: Path, record: RunRecord) -> None:
+    (folder / RUN_FILE).write_text(json.dumps(asdict(record), indent=1) + "\n", encoding="utf-8")
+
+
+def write_run_folder(config: RunConfig, choices: Choices, command: str, results: Sequence[StepResult]) -> Path:
+    """Copy what people look at into ``runs/<name>``; nothing is copied when it is all there already.
+
+    ``report.html``, ``metrics.json``, ``metrics.csv``, ``renders/``, ``errors/``, ``point_cloud.ply`` (the base set;
+    other sets under their own names), ``mesh.ply`` when asked for, ``config.yaml``, ``run.json``.
+    """
+    folder = config.paths.runs / str(config.name)
+    config.paths.runs.mkdir(parents=True, exist_ok=True)
+    with _folder_lock(folder):
+        return _fill_run_folder(folder, config, choices, command, results, _keys(results))
+
+
+def _folder_lock(folder: Path) -> FileLock:
+    return FileLock(str(folder.with_name(f".{folder.name}.lock")))
+
+
+def _keys(results: Sequence[StepResult]) -> dict[str, str]:
+    return {result.step.name: result.step.fingerprint for result in results}
+
+
+def _fill_run_folder(
+    folder: Path,
+    config: RunConfig,
+    choices: Choices,
+    command: str,
+    results: Sequence[StepResult],
+    steps: dict[str, str],
+) -> Path:
+    known = RunRecord.read(folder)
+    if known is not None and known.steps == steps and (folder / PAGE).is_file():
+        return folder
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / RUN_FILE).unlink(missing_ok=True)  # written last: a folder without it is incomplete
+    for left in (*folder.glob("*.ply"), *folder.glob("mesh.*")):  # of another run of this name, with other stages
+        left.unlink(missing_ok=True)
+    places = folders(results)
+    shutil.copyfile(places["report"] / PAGE, folder / PAGE)
+    for name in (TABLE_JSON, TABLE_CSV):
+        shutil.copyfile(places["evaluate"] / name, folder / name)
+    _replace_tree(places["render"] / "images", folder / "renders")
+    _replace_tree(places["evaluate"] / "errors", folder / "errors")
+    for ply in sorted(final_training(results).glob("*.ply")):
+        shutil.copyfile(ply, folder / ("point_cloud.ply" if ply.stem == "base" else ply.name))
+    for mesh in sorted(places["extract_mesh"].glob("mesh.*")) if "extract_mesh" in places else ():
+        shutil.copyfile(mesh, folder / mesh.name)
+    for name in (REPORT_FILE, PICTURE_FILE) if "sfm" in places else ():
+        shutil.copyfile(places["sfm"] / name, folder / name)
+    for name in MASK_FILES if "masks" in places else ():
+        shutil.copyfile(places["masks"] / name, folder / name)
+    (folder / CONFIG_FILE).write_text(config_yaml(config), encoding="utf-8")
+    finished = datetime.now(UTC).isoformat(timespec="seconds")
+    record = RunRecord(str(config.name), command, finished, asdict(choices), steps)
+    _write_record(folder, record)
+    return folder
+
+
+def _replace_tree(source: Path, target: Path) -> None:
+    if target.exists():
+        shutil.rmtree(target)
+    if source.exists():
+        shutil.copytree(source, target)
+
+
+def folders(results: Sequence[StepResult]) -> dict[str, Path]:
+    """The artifact folder of each step by name."""
+    return {result.step.name: result.folder for result in results}
+
+
+def final_training(results: Sequence[StepResult]) -> Path:
+    """The artifact of the last training stage."""
+    trained = [result.folder for result in results if result.step.name.startswith("train_")]
+    return max(trained, key=lambda folder: stage_params(folder).until)
+
+
+def config_yaml(config: RunConfig) -> str:
+    """The resolved config as YAML."""
+    from omegaconf import OmegaConf
+
+    values = asdict(config)
+    return OmegaConf.to_yaml(OmegaConf.create(json.loads(json.dumps(values))))
+
+
+def evaluation_of(results: Sequence[StepResult]) -> EvaluationTable:
+    """The measured table of a run."""
+    return read_json(folders(results)["evaluate"] / TABLE_JSON)
+
+
+def result_table(tables: Sequence[EvaluationTable], seeds: Sequence[int] = ()) -> str:
+    """Runs side by side in plain text; what was not measured is ``n/a``. ``seeds``: shown where they differ."""
+    from rtgs.evaluate.tables import summarize
+
+    seeded = len(set(seeds)) > 1
+    header = ("scene", "method", "preset", *(["seed"] if seeded else []), "views", "PSNR", "SSIM", "LPIPS")
+    rows: list[tuple[str, ...]] = [(*header, "train", "memory", "surfels")]
+    for index, row in enumerate(summarize(tables)):
+        rows.append(
+            (
+                row.scene,
+                row.method,
+                row.preset,
+                *([str(seeds[index])] if seeded else []),
+                f"{row.views} of {row.resolution}" if row.views else "none",
+                _figure(row.psnr, "{:.2f} dB"),
+                _figure(row.ssim, "{:.4f}"),
+                _figure(row.lpips_01, "{:.4f}"),
+                _figure(row.train_seconds, "{:.1f} s"),
+                _figure(row.peak_memory_mb, "{:.0f} MB"),
+                _figure(row.surfels, "{:,}"),
+            )
+        )
+    return columns(rows)
+
+
+def _figure(value: float | None, form: str) -> str:
+    return "n/a" if value is None else form.format(value)
+
+
+def run_info(config: RunConfig, choices: Choices, plan: Plan, parent: str = "") -> RunInfo:
+    """How a run appears in the tracker: names as tags, each step linked by its fingerprint."""
+    target = plan.steps[-1].step
+    tags = {f"rtgs.{key}": getattr(choices, key) for key in ("scene", "method", "preset", "ablation", "experiment")}
+    tags |= {f"rtgs.step.{planned.step.name}": planned.step.fingerprint for planned in plan}
+    tags |= {"rtgs.seed": str(config.seed), **git_tags()}
+    return RunInfo(config.tracking.experiment, str(config.name), target.fingerprint, tags, parent)
+
+
+def track_start(tracker: Tracker, config: RunConfig, choices: Choices, plan: Plan) -> None:
+    """What a person tells runs apart by as parameters; the whole config, what is installed, and the plan."""
+    tracker.params(told_apart(config, choices))
+    with TemporaryDirectory() as folder:
+        for name, text in ((CONFIG_FILE, config_yaml(config)), (INSTALLED_FILE, installed())):
+            path = Path(folder) / name
+            path.write_text(text, encoding="utf-8")
+            tracker.artifact(path)
+    tracker.table("plan", plan_rows(plan))
+
+
+def told_apart(config: RunConfig, choices: Choices) -> dict[str, str]:
+    """The chosen names, the seed and the overrides, by key.
+
+    Not the hundreds of other keys: trackers print all parameters above every picture. What a step read is with the
+    step's own run.
+    """
+    names = ("scene", "method", "preset", "ablation")
+    told = {name: str(getattr(choices, name)) for name in names} | {"seed": str(config.seed)}
+    for word in choices.overrides:
+        key, _, value = word.lstrip("+~").partition("=")
+        if not key.startswith(_NOT_TOLD):
+            told.setdefault(key, value)
+    return told
+
+
+def track_end(tracker: Tracker, folder: Path, results: Sequence[StepResult]) -> None:
+    """Curves over real iterations, final figures, the per-view table, a few pictures, the files of the run folder."""
+    for result in results:
+        if result.step.name.startswith("train_"):
+            for row in read_history(result.folder):
+                step = int(row.pop("step"))
+                tracker.metrics(row, step)
+    table = evaluation_of(results)
+    means = {name: table.mean(name) for name in METRICS}
+    tracker.metrics({f"eval/{name}": value for name, value in means.items() if value is not None})
+    facts = {"train_seconds": table.facts.train_seconds, "peak_memory_mb": table.facts.peak_memory_mb}
+    tracker.metrics({f"cost/{name}": value for name, value in facts.items() if value is not None})
+    if table.object is not None:
+        tracker.metrics({f"object/{name}": value for name, value in table.object.numbers().items()})
+    tracker.metrics({"surfels": float(table.facts.surfels or 0)})
+    tracker.table("eval", [{"view": row.view, **row.values} for row in table.rows])
+    _track_sliders(tracker, results)
+    for path in sorted((folder / "renders").glob("*.png"))[:_TRACKED_IMAGES]:
+        _track_png(tracker, f"renders/{path.stem}", path)
+        _track_png(tracker, f"errors/{path.stem}", folder / "errors" / path.name)
+    for name in (PAGE, TABLE_JSON, TABLE_CSV, RUN_FILE):
+        tracker.artifact(folder / name)
+    for ply in sorted(folder.glob("*.ply")):  # point_cloud.ply, and the sets of later stages
+        tracker.artifact(ply)
+
+
+def _track_sliders(tracker: Tracker, results: Sequence[StepResult]) -> None:
+    """Fixed views and layers at several steps, the last of them as the test views were rendered."""
+    from rtgs.scenes.canonical import read_scene
+
+    places = folders(results)
+    last = final_training(results)
+    for result in results:
+        if result.step.name.startswith("train_"):
+            for picture in training_pictures(result.folder):
+                tracker.image(picture.key, picture.pixels, picture.step)
+    for picture in final_pictures(read_scene(places["import_scene"]), places["render"], stage_params(last).until):
+        tracker.image(picture.key, picture.pixels, picture.step)
+
+
+def _track_png(tracker: Tracker, name: str, path: Path) -> None:
+    import numpy as np
+    from PIL import Image
+
+    if path.is_file():
+        tracker.image(name, np.asarray(Image.open(path).convert("RGB")))
+
+
+def plan_rows(plan: Plan, skipped: Sequence[SkippedStep] = ()) -> list[Mapping[str, str]]:
+    """One row per step of a plan, after those that are not needed."""
+    rows: list[Mapping[str, str]] = [
+        {"step": step.name, "key": "", "state": "skipped", "why": step.why} for step in skipped
+    ]
+    return rows + [
+        {
+            "step": planned.step.name,
+            "key": planned.step.fingerprint[:12],
+            "state": "cached" if planned.hit else "to fetch" if planned.remote else "to run",
+            "why": planned.reason,
+        }
+        for planned in plan
+    ]
+
+
+def report_page(folder: Path, store: Store) -> Path:
+    """The report in a run folder; copied out of the store again when it is gone.
+
+    Raises:
+        RtgsError: it is in neither place.
+    """
+    page = folder / PAGE
+    if page.is_file():
+        return page
+    record = RunRecord.read(folder)
+    key = record.steps.get("report", "") if record else ""
+    cached = store.root / "report" / key[:2] / key / PAGE
+    if not cached.is_file():
+        repeat = record.command if record else "rtgs run ..."
+        raise RtgsError(f"{page} is gone and not in the store either; `{repeat}` makes it again")
+    shutil.copyfile(cached, page)
+    return page
+
+
+def find_run(runs: Path, name: str | None) -> Path:
+    """The folder of the named run, or of the one that finished last.
+
+    Raises:
+        RtgsError: there is none.
+    """
+    found = {folder.name: record for folder in sorted(runs.glob("*")) if (record := RunRecord.read(folder))}
+    if name is None:
+        if not found:
+            raise RtgsError(f"no finished run in {runs}; start one with `rtgs run`")
+        name = max(found, key=lambda each: found[each].finished)
+    elif name not in found:
+        listed = ", ".join(found) or "none"
+        raise RtgsError(f"no finished run {name!r} in {runs}; there is {listed}")
+    return runs / name

@@ -1,0 +1,68 @@
+"""The table that an experiment ends with, from the runs of its sweep."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from pipelines.publishing.results import evaluation_of
+from rtgs.config.schema import RunConfig
+from rtgs.evaluate.publish import PAPER_DATA, Measured, TableSpec, build_table
+from rtgs.evaluate.table_formats import write_table
+from rtgs.workflow import StepResult
+from rtgs.workflow.fingerprint import file_digest
+
+_TRACKED_FILE = ".tracked.json"  # beside a table: digests of its files by the tracker that has them
+
+
+def write_experiment_table(runs: Sequence[tuple[RunConfig, Sequence[StepResult]]]) -> list[Path]:
+    """Write ``<root>/tables/<name>-<preset>/table.{md,csv,tex,html}``; nothing where no table is asked for.
+
+    On the papers' data the folder ends in ``-papers_data``: it does not replace the table of the stand-ins.
+
+    Raises:
+        ValueError: ``table.data`` is unknown, or a combination comes twice.
+    """
+    asked = [(config, results) for config, results in runs if config.table.name]
+    if not asked:
+        return []
+    config = asked[0][0]
+    names = config.table.paper_scenes
+    measured = []
+    for one, results in asked:
+        evaluation = evaluation_of(results)
+        scene = one.scene.name  # not the table's name of it, which says what is a stand-in
+        measured.append(Measured(evaluation, one.seed, names.get(scene, scene)))
+    preset = measured[0].evaluation.facts.preset
+    spec = TableSpec(config.table.name, config.table.title or config.table.name, config.table.data)
+    folder = f"{config.table.name}-{preset}" + ("-papers_data" if spec.data == PAPER_DATA else "")
+    return list(write_table(config.paths.tables / folder, build_table(spec, measured)))
+
+
+def is_table_tracked(paths: Sequence[Path], place: str) -> bool:
+    """Whether the tracker at ``place`` has these very files, by the note beside them."""
+    return _tracked_digests(paths).get(place) == _digests(paths)
+
+
+def note_table_tracked(paths: Sequence[Path], place: str) -> None:
+    """Note beside the files of a table that the tracker at ``place`` has them."""
+    note = paths[0].with_name(_TRACKED_FILE)
+    partial = note.with_name(f"{note.name}.{os.getpid()}")
+    known = {**_tracked_digests(paths), place: _digests(paths)}
+    partial.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
+    os.replace(partial, note)
+
+
+def _tracked_digests(paths: Sequence[Path]) -> dict[str, dict[str, str]]:
+    with suppress(OSError, ValueError):
+        known = json.loads(paths[0].with_name(_TRACKED_FILE).read_text(encoding="utf-8"))
+        if isinstance(known, dict):
+            return known
+    return {}
+
+
+def _digests(paths: Sequence[Path]) -> dict[str, str]:
+    return {path.name: file_digest(path) for path in paths}

@@ -1,0 +1,208 @@
+"""One self-contained HTML page of a run: numbers, pictures, curves, and how it was made."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pipelines.steps import extract_mesh, train_transmittance
+from pipelines.steps.evaluate import TABLE_JSON
+from pipelines.steps.training import last_training, read_history, read_summary
+from pipelines.steps.views import read_render
+from rtgs.workflow import StepContext, StepKind
+from rtgs.workflow.manifest import Manifest
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from rtgs.evaluate.records import EvaluationTable
+    from rtgs.report.figures import Curve
+    from rtgs.report.page import Decision, MeshFigure, ReportView, StepLine
+
+PAGE = "report.html"
+
+
+@dataclass(frozen=True)
+class ReportParams:
+    """What the page says besides what it reads from the steps before it."""
+
+    title: str
+    command: str
+    config: dict[str, tuple[str, str]]
+    """Value and default of every config key that has to do with the result."""
+    decisions: tuple[tuple[str, str], ...] = ()
+    """What the graph left out, and why."""
+    views: int = 4
+    """How many test views are shown: the best, the worst, and evenly between."""
+
+
+def report(params: ReportParams, context: StepContext) -> None:
+    """Write ``report.html``."""
+    from rtgs.evaluate.records import read_json
+    from rtgs.report.page import ConfigLine, Decision, ReportData, write_report
+
+    inputs = context.inputs
+    table = read_json(inputs["evaluate"] / TABLE_JSON)
+    training = last_training(inputs)
+    summary = read_summary(training)
+    manifest = Manifest.read(training)
+    assert manifest is not None
+    decisions = [Decision(*item) for item in params.decisions]
+    decisions += _prepared(inputs)
+    decisions += [Decision(**item) for item in summary["decisions"]]  # pyright: ignore[reportGeneralTypeIssues]
+    decisions += _mesh_decisions(inputs)
+    decisions += _boundary(training)
+    decisions += _guide(table)
+    data = ReportData(
+        title=params.title,
+        evaluation=table,
+        command=params.command,
+        created=datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
+        views=_views(table, inputs, params.views),
+        curves=_curves(inputs),
+        steps=_steps(context),
+        decisions=tuple(decisions),
+        config=tuple(ConfigLine(key, *both) for key, both in sorted(params.config.items())),
+        machine={key: str(value) for key, value in (manifest.machine | manifest.versions).items()},
+        mesh=_mesh(inputs["extract_mesh"]) if "extract_mesh" in inputs else None,
+    )
+    size = write_report(context.out / PAGE, data)
+    context.log.info("report of %.1f MB", size / 1e6)
+    context.tracker.artifact(context.out / PAGE)
+
+
+def _prepared(inputs: Mapping[str, Path]) -> list[Decision]:
+    """How good the poses are and what to do about it, how masks (a classical fallback is named as such) and normals
+    were made."""
+    from rtgs.prepare.masks.report import MaskReport
+    from rtgs.prepare.normals.make import read_message
+    from rtgs.prepare.poses.quality import SfmReport
+    from rtgs.report.page import Decision
+    from rtgs.scenes.capture import list_some
+
+    lines = []
+    if "sfm" in inputs:
+        poses = SfmReport.read(inputs["sfm"])
+        missing = f"; without a pose: {list_some(poses.missing)}" if poses.missing else ""
+        lines += [Decision("poses", f"{poses}{missing}"), *(Decision("advice", line) for line in poses.advice)]
+    if "masks" in inputs:
+        made = MaskReport.read(inputs["masks"])
+        lines.append(Decision("masks", "; ".join((str(made), *made.notes))))
+    if "normals" in inputs:
+        lines.append(Decision("normals", read_message(inputs["normals"])))
+    return lines
+
+
+def _views(table: EvaluationTable, inputs: Mapping[str, Path], count: int) -> tuple[ReportView, ...]:
+    from rtgs.report.page import ReportView, pick_views
+    from rtgs.scenes.canonical import read_scene
+
+    photos = {view.name: view for view in read_scene(inputs["import_scene"]).test}
+    views = []
+    for row, role in pick_views(table, count):
+        name = table.rows[row].view
+        maps = read_render(inputs["render"], name)
+        photo = photos[name]
+        shown = {key: maps.get(key) for key in ("depth", "normal", "alpha")}
+        seen = (name, photo.camera, photo.image, maps["image"], role)
+        views.append(ReportView(*seen, layers=_layers(maps), mask=photo.mask, truth=photo.truth, **shown))
+    return tuple(views)
+
+
+def _layers(maps: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The layers of a rendered view as the page takes them; none for methods without reflection."""
+    if "reflection" not in maps:
+        return {}
+    names = ("reflection", "transmission", "normal", "specular", "roughness", "f0")
+    return {"diffuse": (1 - maps["specular"]) * maps["diffuse"]} | {name: maps[name] for name in names if name in maps}
+
+
+def _boundary(training: Path) -> list[Decision]:
+    """How well the transparent object's surface is known, where a third stage has written it down."""
+    from rtgs.evaluate.boundary import BoundaryScores
+    from rtgs.report.page import Decision
+
+    path = training / train_transmittance.BOUNDARY_FILE
+    if not path.is_file():
+        return []
+    scores = json.loads(path.read_text(encoding="utf-8"))
+    return [
+        Decision(f"object's surface {when} the third stage", str(BoundaryScores(**scores[when]))) for when in scores
+    ]
+
+
+def _guide(table: EvaluationTable) -> list[Decision]:
+    """Where the object's mesh gives no pair of surfaces, and how far it is from the true container."""
+    from rtgs.report.page import Decision
+
+    known = table.object
+    if known is None:
+        return []
+    lines = [Decision("rays without two surfaces", known.fallbacks)]
+    if known.distance is not None:
+        front, back = ("none to judge" if share is None else f"{share:.3f}" for share in (known.front, known.back))
+        why = (
+            f"{known.distance:.4f} of its diagonal on average; share of the pixels whose surface is within 3 %: first "
+        )
+        lines.append(Decision("mesh and true container", f"{why}{front}, second {back}"))
+    return lines
+
+
+def _mesh_decisions(inputs: Mapping[str, Path]) -> list[Decision]:
+    """How the transparent object's mesh was chosen."""
+    from rtgs.report.page import Decision
+
+    if "extract_mesh" not in inputs:
+        return []
+    record = json.loads((inputs["extract_mesh"] / extract_mesh.SUMMARY_FILE).read_text(encoding="utf-8"))
+    return [Decision(what, why) for what, why in record.get("decisions", [])]
+
+
+def _mesh(folder: Path) -> MeshFigure | None:
+    """None: the scene turned out to have no transparent object."""
+    import numpy as np
+    from PIL import Image
+
+    from rtgs.report.page import MeshFigure
+
+    if extract_mesh.why_absent(folder):
+        return None
+    record = json.loads((folder / extract_mesh.SUMMARY_FILE).read_text(encoding="utf-8"))
+    pixels = np.asarray(Image.open(folder / extract_mesh.PICTURE_FILE).convert("RGB"))
+    note = f"{record['note']} Seen from {record['picture_from']}."
+    return MeshFigure(pixels, record["vertices"], record["faces"], note)
+
+
+def _curves(inputs: Mapping[str, Path]) -> tuple[Curve, ...]:
+    """Every recorded series, the stages of training joined."""
+    from rtgs.report.figures import Curve
+
+    series: dict[str, list[tuple[int, float]]] = {}
+    for name, folder in inputs.items():
+        if name.startswith("train_"):
+            for row in read_history(folder):
+                for key in row.keys() - {"step"}:
+                    series.setdefault(key, []).append((int(row["step"]), row[key]))
+    return tuple(
+        Curve(name, tuple(step for step, _ in points), tuple(value for _, value in points))
+        for name, points in sorted(series.items())
+    )
+
+
+def _steps(context: StepContext) -> tuple[StepLine, ...]:
+    from rtgs.report.page import StepLine
+
+    lines = []
+    for name, folder in context.inputs.items():
+        manifest = Manifest.read(folder)
+        assert manifest is not None
+        hit = manifest.fingerprint not in context.executed
+        lines.append(StepLine(name, manifest.fingerprint, hit, manifest.duration))
+    return tuple(lines)
+
+
+STEP = StepKind("report", 6, report, helpers=("rtgs.report.page", "rtgs.report.figures", "rtgs.report.layers"))

@@ -1,0 +1,108 @@
+// Gradient rows of the tracer's backward pass: their layout, what a ray puts into them, how threads share them.
+#pragma once
+#include "trace/packet.h"
+
+namespace rtgs::RTGS_ISA {
+
+constexpr int kMostColumns = 48;  // of features and colours, and of the coefficients of sh_rest, padded
+static constexpr int padded(int floats) { return (floats + kLanes - 1) / kLanes * kLanes; }
+
+struct RowLayout {
+  int channels, coefficients, floats;  // the first two padded to whole registers
+  explicit RowLayout(const TraceSurfels& s)
+      : channels(padded(s.feature_count() + s.colour_count())),
+        coefficients(s.sh_dc ? padded(3 * rest_count(s.degree)) : 0),
+        floats(kTraceGradChannels + channels + coefficients) {}
+};
+
+// Upstream gradients of one ray, as the rows of the surfels it hit want them. Every hit adds weight times this.
+struct alignas(64) RayRow {
+  float channels[kMostColumns];      // features, colours
+  float coefficients[kMostColumns];  // colour c times basis k, at 3 k + c
+  float pattern[kMostColumns];       // colour c at 3 k + c
+};
+
+// Bits of a ray row that stay where some colours of a surfel are clamped at zero; by those colours, a bit each.
+struct alignas(64) ColorMasks {
+  uint32_t channels[8][kMostColumns], coefficients[8][kMostColumns];
+  explicit ColorMasks(int features) {
+    for (int clamped = 0; clamped < 8; ++clamped) {
+      for (int c = 0; c < kMostColumns; ++c)
+        channels[clamped][c] = c >= features && c < features + 3 && clamped >> (c - features) & 1 ? 0 : ~0u;
+      for (int c = 0; c < kMostColumns; ++c) coefficients[clamped][c] = clamped >> (c % 3) & 1 ? 0 : ~0u;
+    }
+  }
+};
+
+struct SurfelHits {  // of one packet on one surfel
+  uint32_t lanes;
+  bool clamped;                    // any colour of any hit
+  alignas(64) float weights[kLanes];
+  uint8_t clamped_colors[kLanes];  // where clamped
+};
+
+static inline SurfelHits surfel_hits(vmask met, vfloat w, uint64_t clamped) {
+  SurfelHits hits;
+  hits.lanes = mask_bits(met);
+  store(hits.weights, w);
+  clamped &= hits.lanes * 0x000100010001ull;  // what the other rays would see does not matter
+  hits.clamped = clamped != 0;
+  if (hits.clamped)
+    for (uint32_t left = hits.lanes; left; left &= left - 1) {
+      const int lane = __builtin_ctz(left);
+      const uint64_t bits = clamped >> lane;
+      hits.clamped_colors[lane] = uint8_t((bits & 1) | (bits >> 15 & 2) | (bits >> 30 & 4));
+    }
+  return hits;
+}
+
+// ---- threads -----------------------------------------------------------------------------------------------------
+// Ranges of about equal work: range_starts. And to which range each surfel's row belongs.
+static inline void split_work(const TraceBackwardArgs& args) {
+  const int64_t packets = packet_count(args.rays);
+  const int threads = args.options.threads;
+  int64_t total = 0, done = 0;
+  const auto work = [&](int64_t p) { return int64_t(args.tapes[p].hits) + 8 * args.tapes[p].surfels; };
+  for (int64_t packet = 0; packet < packets; ++packet) total += work(packet);
+  int range = 0;
+  for (int64_t packet = 0; packet < packets; ++packet) {
+    while (range < threads && done * threads >= total * range) args.range_starts[range++] = packet;
+    done += work(packet);
+  }
+  while (range <= threads) args.range_starts[range++] = packets;
+  if (threads == 1 || !args.surfel_gradients) return;
+  memset(args.owners, 0x7f, size_t(args.surfels.arrays.count) * sizeof(int32_t));
+#pragma omp parallel for num_threads(threads) schedule(static, 1)
+  for (int part = 0; part < threads; ++part)
+    for (int64_t packet = args.range_starts[part]; packet < args.range_starts[part + 1]; ++packet)
+      for (int32_t k = 0; k < args.tapes[packet].surfels; ++k) {
+        int32_t* owner = args.owners + args.tapes[packet].slots[k];
+        int32_t before = __atomic_load_n(owner, __ATOMIC_RELAXED);
+        while (part < before &&
+               !__atomic_compare_exchange_n(owner, &before, part, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {
+        }
+      }
+}
+
+// Each thread takes a share of the slots, so that the order of additions to a row is that of the packets.
+static inline void add_waiting(const TraceBackwardArgs& args) {
+  const int threads = args.options.threads;
+  const int64_t count = args.surfels.arrays.count;
+  const int floats = RowLayout(args.surfels).floats;
+#pragma omp parallel for num_threads(threads) schedule(static, 1)
+  for (int part = 0; part < threads; ++part) {
+    const int64_t begin = count * part / threads, end = count * (part + 1) / threads;
+    for (int range = 1; range < threads; ++range) {
+      TraceWorkspace& from = workspace_of(args.workspaces, range);
+      for (int64_t k = 0; k < from.waiting; ++k) {
+        const int64_t slot = from.waiting_slots[k];
+        if (slot < begin || slot >= end) continue;
+        const float* waiting = from.waiting_rows.data + args.row_stride * k;
+        float* row = args.rows + args.row_stride * slot;
+        for (int c = 0; c < floats; c += kLanes) store(row + c, load(row + c) + load(waiting + c));
+      }
+    }
+  }
+}
+
+}  // namespace rtgs::RTGS_ISA

@@ -1,0 +1,170 @@
+"""Running a plan in this process, one step after another, each at most once across all processes on the store."""
+
+from __future__ import annotations
+
+import logging
+import time
+import traceback
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from filelock import Timeout
+
+from rtgs.track import NullTracking, RunInfo, Tracking
+from rtgs.workflow.expectation import Expectation, PlanClock, spoken
+from rtgs.workflow.fingerprint import flatten
+from rtgs.workflow.outcome import StepOutcome, SweepOutcomes, blocked
+from rtgs.workflow.plan import Plan
+from rtgs.workflow.remote import RemoteStore, RemoteStoreError
+from rtgs.workflow.step import Step, StepContext, StepFailed
+from rtgs.workflow.store import Artifact, Store
+
+STEPS_EXPERIMENT = "rtgs/steps"
+log = logging.getLogger("rtgs.workflow")
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """The artifact of one step; ``executed`` when this process made it."""
+
+    step: Step
+    folder: Path
+    duration: float
+    executed: bool
+
+
+class Executor(Protocol):
+    """Runs the merged plan of a sweep: :class:`InlineExecutor` here, :mod:`rtgs.workflow.engine` on many workers."""
+
+    def attempt(self, plan: Plan) -> SweepOutcomes:
+        """Bring every step into the store that can be; one that fails stops only what builds on it."""
+        ...
+
+
+class InlineExecutor:
+    """Steps in order, in this process; the store's locks keep other processes from doing the same work twice."""
+
+    def __init__(self, store: Store, tracking: Tracking | None = None, remote: RemoteStore | None = None) -> None:
+        """``remote``: looked into before a step is run, and given what was run."""
+        self.store = store
+        self.tracking = tracking or NullTracking()
+        self.remote = remote
+
+    def execute(self, plan: Plan) -> tuple[StepResult, ...]:
+        """Bring every step of the plan into the store.
+
+        Raises:
+            StepFailed: a step raised; its message names the step and ``__cause__`` is the step's own exception.
+        """
+        results: list[StepResult] = []
+        clock = PlanClock(plan, Expectation(self.store))
+        for number, planned in enumerate(plan, start=1):
+            executed = frozenset(result.step.fingerprint for result in results if result.executed)
+            left = "" if planned.hit else f", {spoken(clock.left())} left of the plan"
+            result = self.ensure(planned.step, f"[{number}/{len(plan)}{left}]", executed)
+            clock.finish(planned.step.fingerprint, result.duration if result.executed else None)
+            results.append(result)
+        return tuple(results)
+
+    def attempt(self, plan: Plan) -> SweepOutcomes:
+        """Bring every step into the store that can be; one that fails stops only what builds on it."""
+        done: dict[str, StepOutcome] = {}
+        clock = PlanClock(plan, Expectation(self.store))
+        for number, planned in enumerate(plan, start=1):
+            before = (done[other.fingerprint] for other in planned.step.upstream)
+            position = f"[{number}/{len(plan)}, {spoken(clock.left())} left of the plan]"
+            outcome = self.outcome(planned.step, position, before)
+            clock.finish(outcome.fingerprint, outcome.duration if outcome.executed else None)
+            done[planned.step.fingerprint] = outcome
+        return SweepOutcomes(done)
+
+    def outcome(self, step: Step, position: str, before: Iterable[StepOutcome]) -> StepOutcome:
+        """:meth:`ensure` without an exception; ``before``: outcomes of the steps that ``step`` builds on."""
+        before = tuple(before)
+        if stopped := blocked(step, before):
+            return stopped
+        try:
+            result = self.ensure(step, position, frozenset(one.fingerprint for one in before if one.executed))
+        except StepFailed as error:
+            log.error("%s", error)
+            trace = "".join(traceback.format_exception(error.error))
+            return StepOutcome(step.name, step.fingerprint, None, 0.0, True, str(error), step.fingerprint, trace)
+        return StepOutcome(step.name, step.fingerprint, result.folder, result.duration, result.executed)
+
+    def ensure(self, step: Step, position: str, executed: frozenset[str]) -> StepResult:
+        """Bring one step, whose upstream is here, into the store.
+
+        Raises:
+            StepFailed: the step raised.
+        """
+        if artifact := self.store.find(step):
+            log.info("%s %s from the cache", position, step.label)
+            return _result(step, artifact, executed=False)
+        with self._locked(step, position):
+            if artifact := self.store.find(step):
+                log.info("%s %s was made by another process", position, step.label)
+                return _result(step, artifact, executed=False)
+            if self.remote and (artifact := self.remote.fetch(step.name, step.fingerprint, self.store)):
+                log.info("%s %s from %s", position, step.label, self.remote.url)
+                return _result(step, artifact, executed=False)
+            log.info("%s %s", position, step.label)
+            artifact = self._run(step, executed)
+            self._share(step, artifact)
+            log.info("%s %s done in %.1f s", position, step.label, artifact.manifest.duration)
+            return _result(step, artifact, executed=True)
+
+    def _share(self, step: Step, artifact: Artifact) -> None:
+        """Give a new artifact to the remote store. A failure costs others time, not this run its result."""
+        if self.remote is None:
+            return
+        try:
+            self.remote.push(artifact)
+        except RemoteStoreError as error:
+            log.warning("%s could not be sent (`rtgs cache push` does it later): %s", step.label, error)
+
+    @contextmanager
+    def _locked(self, step: Step, position: str) -> Iterator[None]:
+        lock = self.store.lock(step)
+        try:
+            lock.acquire(timeout=0)
+        except Timeout:
+            log.info("%s %s: waiting for another process that is at work on it", position, step.label)
+            lock.acquire()
+        try:
+            yield
+        finally:
+            lock.release()
+
+    def _run(self, step: Step, executed: frozenset[str]) -> Artifact:
+        """Execute under the lock. A failed attempt leaves nothing but its checkpoints."""
+        self.store.discard_attempts(step)
+        attempt, partial = self.store.new_attempt(step.name, step.fingerprint), self.store.partial(step)
+        partial.mkdir(parents=True, exist_ok=True)
+        inputs = {other.name: self.store.folder(other) for other in step.upstream}
+        tags = {f"rtgs.upstream.{other.name}": other.fingerprint for other in step.upstream}
+        info = RunInfo(STEPS_EXPERIMENT, step.label, step.fingerprint, {"rtgs.step": step.name, **tags})
+        start = time.perf_counter()
+        try:
+            with self.tracking.run(info) as tracker:
+                tracker.params({key: _scalar(value) for key, value in flatten(step.recipe).items()})
+                messages = logging.getLogger(f"rtgs.{step.name}")
+                context = StepContext(inputs, attempt, partial, messages, tracker, executed)
+                step.run(step.params, context)
+                return self.store.publish(step, attempt, time.perf_counter() - start)
+        except Exception as error:
+            raise StepFailed(step, error) from error
+        finally:
+            self.store.drop(attempt)
+            if partial.exists() and not any(partial.iterdir()):
+                partial.rmdir()
+
+
+def _scalar(value: object) -> str | int | float | bool | None:
+    return value if value is None or isinstance(value, (str, int, float, bool)) else str(value)
+
+
+def _result(step: Step, artifact: Artifact, *, executed: bool) -> StepResult:
+    return StepResult(step, artifact.folder, artifact.manifest.duration, executed)

@@ -1,0 +1,119 @@
+"""How long steps will take: from what the store's manifests record of others, else from a table.
+
+The one consumer is the progress display; nothing is decided by it.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from rtgs.workflow.manifest import Manifest
+from rtgs.workflow.plan import Plan
+from rtgs.workflow.step import Step
+from rtgs.workflow.store import Store
+
+SECONDS = {
+    "sfm": 120.0,
+    "masks": 120.0,
+    "normals": 60.0,
+    "synthesize": 600.0,
+    "import_scene": 3.0,
+    "extract_mesh": 20.0,
+}
+SECONDS |= {"render": 4.0, "evaluate": 4.0, "report": 3.0}
+"""What a step takes at 400 pixels on one core, where none of its kind was ever run here."""
+OTHER_SECONDS = 10.0
+TRAINING_STEP_SECONDS = {"train_diffuse": 0.03, "train_reflection": 0.12}
+OTHER_TRAINING_STEP_SECONDS = 0.2
+_PRIOR_SECONDS = 20.0  # weight of the expectation against what was seen
+
+
+def training_steps(params: Mapping[str, Any]) -> int | None:
+    """How many training steps a recipe asks for; None where it is no training."""
+    first, until = params.get("from_step"), params.get("until")
+    return until - first if isinstance(first, int) and isinstance(until, int) else None
+
+
+class Expectation:
+    """Seconds a step will take, by the median of the runs of its kind that resemble it most."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._recorded: dict[str, list[Manifest]] = {}
+
+    def seconds(self, step: Step) -> float:
+        """Of runs of this step name, those of the same method if there are any; training by the number of its steps."""
+        if step.name not in self._recorded:
+            self._recorded[step.name] = [artifact.manifest for artifact in self._store.artifacts(step.name)]
+        count, recorded = training_steps(step.recipe), self._recorded[step.name]
+        if not recorded:
+            return _from_table(step.name, count)
+        method = _method(step.recipe)
+        alike = [manifest for manifest in recorded if _method(manifest.params) == method] or recorded
+        if count is None:
+            return statistics.median(manifest.duration for manifest in alike)
+        pace = [manifest.duration / max(training_steps(manifest.params) or count, 1) for manifest in alike]
+        return count * statistics.median(pace)
+
+
+def _from_table(name: str, count: int | None) -> float:
+    if count is None:
+        return SECONDS.get(name, OTHER_SECONDS)
+    return count * TRAINING_STEP_SECONDS.get(name, OTHER_TRAINING_STEP_SECONDS)
+
+
+def _method(params: Mapping[str, Any]) -> object:
+    method = params.get("method")
+    return method.get("name") if isinstance(method, Mapping) else method
+
+
+class PlanClock:
+    """How much of a plan is done, by weight, and how long the rest will take.
+
+    What steps really took corrects the expectation of the others; the first seconds count little.
+    """
+
+    def __init__(self, plan: Plan, expectation: Expectation, lanes: int = 1, now: Callable[[], float] = time.monotonic):
+        """``lanes``: how many steps run at a time."""
+        todo = [planned.step for planned in plan if not planned.hit]
+        self.weights = {step.fingerprint: max(expectation.seconds(step), 0.01) for step in todo}
+        self._left = dict(self.weights)
+        self._lanes = max(1, lanes)
+        self._now = now
+        self._expected = self._took = _PRIOR_SECONDS
+        self._since = now()
+
+    @property
+    def total(self) -> float:
+        """Expected seconds of all steps that are not cached."""
+        return sum(self.weights.values())
+
+    @property
+    def done(self) -> float:
+        """Expected seconds of those that are done."""
+        return self.total - sum(self._left.values())
+
+    def finish(self, fingerprint: str, took: float | None) -> None:
+        """A step is done; ``took`` seconds if it was executed, None where it was not (cached, failed, blocked)."""
+        weight = self._left.pop(fingerprint, None)
+        if weight is None:
+            return
+        self._since = self._now()
+        if took is not None:
+            self._expected += weight
+            self._took += took
+
+    def left(self) -> float:
+        """Seconds until everything is done, as far as one can tell."""
+        rest = sum(self._left.values()) * self._took / self._expected / min(self._lanes, max(len(self._left), 1))
+        return max(rest - (self._now() - self._since), 0.0)
+
+
+def spoken(seconds: float) -> str:
+    """``0:07``, ``12:30`` or ``3:05:00``."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
