@@ -26,8 +26,8 @@ from torch import Tensor
 if TYPE_CHECKING:
     from rtgs.config.schema import RunConfig
     from rtgs.methods import Method
-    from rtgs.methods.base import SpecularLayers
     from rtgs.scenes.scene import Scene, View
+    from rtgs.train.method import SpecularLayers
 
 HELD_OUT = 8  # every so many training views
 MIRROR_BALL = "mirror_ball"  # of the tests, instead of an embedded scene
@@ -175,8 +175,7 @@ def trained(config: RunConfig, scene: Scene, seed: int, first: dict[str, Tensor]
 
 def first_stage(config: RunConfig, setting: Setting, seed: int) -> dict[str, Tensor] | None:
     """The state at the end of the first stage, kept for all choices that agree on it; None where there is one stage."""
-    from rtgs.methods import create_method
-    from rtgs.methods.stages import stage_settings
+    from rtgs.methods import create_method, find_method
     from rtgs.train.seeds import generator_for
     from rtgs.train.trainer import Trainer
 
@@ -189,7 +188,13 @@ def first_stage(config: RunConfig, setting: Setting, seed: int) -> dict[str, Ten
         return method.state()
 
     reads = repr(
-        (stage_settings(config.method, "diffuse"), config.schedule, seed, setting.side, method.stages[0].until)
+        (
+            find_method(config.method.name).stage("diffuse").reads(config.method),
+            config.schedule,
+            seed,
+            setting.side,
+            method.stages[0].until,
+        )
     )
     return cached(setting.root / f"first-{setting.scene}-{sha256(reads.encode()).hexdigest()[:12]}.pt", make)
 
@@ -207,10 +212,10 @@ def cached(path: Path, make: Callable[[], dict[str, Tensor]]) -> dict[str, Tenso
 def score(method: Method, choice: str, seed: int, seconds: float, setting: Setting) -> ChoiceScore:
     """Render the held-out views, and some of the training views, and compare."""
     from rtgs.evaluate.metrics import psnr
-    from rtgs.methods import RenderOptions
+    from rtgs.methods import Mode, RenderOptions
 
     def rendered(view: View):
-        return method.render(view.camera, method.schedule.total, RenderOptions(layers=True, normal=True))
+        return method.render(view.camera, method.schedule.total, Mode.EVALUATE, RenderOptions(layers=True, normal=True))
 
     rows, layers = [], []
     for view in setting.judged:

@@ -23,15 +23,16 @@ from torch import Tensor
 from benchmarks.yardstick_scene import yardstick_case
 from rtgs.core.cameras import Camera
 from rtgs.gaussians.surfels import ActivatedSurfels
-from rtgs.methods.base import LossTerms, RenderedView
-from rtgs.methods.gs2d import Gs2d
-from rtgs.methods.surfel_set import SurfelSet
+from rtgs.methods import create_method
+from rtgs.methods.parts.gaussian_set import GaussianSet
+from rtgs.methods.parts.kinds import surfel_options
 from rtgs.native import core
 from rtgs.render.buffers import RasterBuffers
 from rtgs.render.surfels import rasterize_surfels
 from rtgs.scenes.scene import Scene, View
 from rtgs.train.guard import check_loss
 from rtgs.train.losses import normal_consistency_loss, photometric_loss
+from rtgs.train.method import LossValues, Mode, RenderedView
 from rtgs.train.settings import LossSettings, MethodSettings, OptimizerSettings, ScheduleSettings
 
 STEP = 10  # any step at which all SH degrees are active
@@ -48,31 +49,31 @@ class StepBench:
         still = OptimizerSettings(1e-12, 1e-12, 1e-9, 1e-9, 1e-9, 1e-9, 1e-9)  # full work, but nothing moves
         settings = MethodSettings(optimizer=still, loss=LossSettings(normal=0.05, normal_start=0))
         schedule = ScheduleSettings(sh_every=1, densify_until=0)
-        self.method = Gs2d(settings, scene, schedule, generator)
-        self.method.base = SurfelSet(
+        self.method = create_method(settings, scene, schedule, generator)
+        self.method.base.set = GaussianSet(
             "base", surfels, optimizer=still, density=settings.density, means_lr_steps=100, extent=scene.extent
         )
         with torch.no_grad():  # a target near the picture, as late in training
-            picture = self.method.render(camera, STEP).image
+            picture = self.method.render(camera, STEP, Mode.TRAIN).image
             target = (picture + 0.05 * torch.randn(picture.shape, generator=generator)).clamp(0, 1)
         self.view = replace(blank, image=target)
         self.camera: Camera = camera
 
-    def forward(self) -> tuple[RenderedView, LossTerms]:
-        rendered = self.method.render(self.camera, STEP)
+    def forward(self) -> tuple[RenderedView, LossValues]:
+        rendered = self.method.render(self.camera, STEP, Mode.TRAIN)
         return rendered, self.method.losses(rendered, self.view, STEP)
 
     def whole(self) -> None:
         """One step as in ``Trainer._train_step``."""
-        _, terms = self.forward()
+        rendered, terms = self.forward()
         check_loss(terms, self.method, STEP, self.view.name)
         terms.total.backward()
-        self.method.after_step(STEP)
+        self.method.after_step(STEP, rendered.observations)
 
     def parts(self) -> dict[str, Callable[[], object]]:
         """The parts of the step on the tensors and with the upstream gradients of a real one."""
         rendered, terms = self.forward()
-        buffers, base = rendered.buffers, self.method.base
+        buffers, base = rendered.buffers, self.method["base"]
         outputs = _with_gradient(buffers)
         upstream = torch.autograd.grad(terms.total, outputs, allow_unused=True)
         activated = base.activated(self.camera.center.float(), 3)
@@ -80,7 +81,9 @@ class StepBench:
         shaded_upstream = [torch.randn(t.shape) for t in inputs[1:]]
         leaves = [tensor.detach().clone().requires_grad_() for tensor in inputs]
         means, tangent_u, tangent_v, scales, opacities, colors = leaves
-        options = self.method.raster_options(self.method.training_options(STEP), weight_sum=True)
+        options = surfel_options(
+            self.method.loss.needs(STEP), self.method.settings.render, self.method.extent, weight_sum=True
+        )
         background = torch.zeros(3)
         weights = self.method.settings.loss
         image = buffers.features.detach().requires_grad_()

@@ -122,11 +122,10 @@ def clocks(clock: PartClock) -> Iterator[None]:
     from rtgs.gaussians import activate
     from rtgs.gaussians.adam import SurfelAdam
     from rtgs.gaussians.density import DensityControl
-    from rtgs.methods.reflective import ReflectiveMethod
-    from rtgs.methods.surfel_base import SurfelMethod
-    from rtgs.methods.surfel_set import SurfelSet
-    from rtgs.methods.traced_set import FollowingTree
-    from rtgs.methods.transmittance import TransmissiveMethod
+    from rtgs.methods.model import Model
+    from rtgs.methods.parts.gaussian_set import GaussianSet
+    from rtgs.methods.parts.mirror import Mirror
+    from rtgs.methods.parts.traced_set import FollowingTree
     from rtgs.render import ellipsoids, trace
     from rtgs.render import surfels as rasterize
     from rtgs.train import losses
@@ -143,14 +142,12 @@ def clocks(clock: PartClock) -> Iterator[None]:
     wanted = [(owner, name, part) for owner, part in functions for name in ("forward", "backward")]
     wanted += [
         (FollowingTree, "current", "tree"),
-        (SurfelMethod, "losses", "losses"),
-        (ReflectiveMethod, "losses", "losses"),
-        (TransmissiveMethod, "losses", "losses"),
+        (Model, "losses", "losses"),
         (SurfelAdam, "step", "adam"),
-        (SurfelSet, "_clamp", "adam"),
-        (SurfelSet, "densify", "density"),
+        (GaussianSet, "_clamp", "adam"),
+        (GaussianSet, "densify", "density"),
         (DensityControl, "observe", "density"),
-        (ReflectiveMethod, "_choose", "choose"),
+        (Mirror, "_choose", "choose"),
     ]
     undo = [clock.wrap(*entry) for entry in wanted]
     try:
@@ -191,7 +188,7 @@ def found_mesh(method: Method, step: int, scene: Scene, config: RunConfig) -> Ob
 
 def fixed_seconds(method: Method, scene: Scene, stage: Stage, now: Callable[[], float]) -> float:
     """Median seconds of a step with next to nothing in it: a picture 16 pixels wide, sets of some hundred surfels."""
-    from rtgs.methods import create_method
+    from rtgs.methods import Mode, create_method
     from rtgs.train.seeds import generator_for
 
     view = next((view for view in scene.train if view.mask is not None and view.mask.any()), scene.train[0])
@@ -219,7 +216,7 @@ def fixed_seconds(method: Method, scene: Scene, stage: Stage, now: Callable[[], 
     times = []
     for _ in range(SMALL_STEPS):
         start = now()
-        rendered = other.render(camera, stage.until - 1, None, mask)
+        rendered = other.render(camera, stage.until - 1, Mode.TRAIN, mask=mask)
         other.losses(rendered, small, stage.until - 1).total.backward()
         for part in other.sets:
             part.step(stage.until - 1, 3)
@@ -231,7 +228,7 @@ def measure(words: Sequence[str], shrunk: Sequence[str], threads: int) -> Traini
     """Compose, load, train under the clocks, every stage; ``shrunk``: the words that shorten the schedule."""
     from rtgs.config.compose import compose
     from rtgs.mesh.silhouettes import why_unbounded
-    from rtgs.methods import create_method, method_stages
+    from rtgs.methods import create_method, find_method
     from rtgs.scenes.scene import load_scene
     from rtgs.train.seeds import generator_for
 
@@ -246,7 +243,10 @@ def measure(words: Sequence[str], shrunk: Sequence[str], threads: int) -> Traini
         generator = generator_for(config.seed, "initialise")
         return create_method(config.method, scene, config.schedule, generator, mesh)
 
-    both = (method_stages(one.method, one.schedule, transparent=transparent) for one in (config, whole))
+    both = (
+        find_method(one.method.name).timeline(one.method, one.schedule, transparent=transparent)
+        for one in (config, whole)
+    )
     method, found, times = new(), [], (0.0, 0.0)
     for stage, complete in zip(*both, strict=True):
         if stage.name == "transmittance":

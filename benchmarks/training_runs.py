@@ -31,11 +31,13 @@ class TrainedRun:
         """Means over the held-out views: psnr, ssim, and psnr_specular and psnr_diffuse_part where truth is known."""
         from rtgs.evaluate.evaluate import EvaluationSettings, TimedRender, evaluate_views
         from rtgs.evaluate.records import RunFacts
-        from rtgs.methods import RenderOptions
+        from rtgs.methods import Mode, RenderOptions
 
         with torch.no_grad():
             steps = self.method.schedule.total
-            images = [self.method.render(view.camera, steps, RenderOptions()).image for view in self.scene.test]
+            images = [
+                self.method.render(view.camera, steps, Mode.EVALUATE, RenderOptions()).image for view in self.scene.test
+            ]
         settings = EvaluationSettings(lpips=False, masked=False, eight_bit=False)
         facts = RunFacts(self.scene.name, "")
         table = evaluate_views([TimedRender(image) for image in images], self.scene.test, facts, settings)

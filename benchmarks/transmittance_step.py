@@ -23,8 +23,8 @@ from benchmarks.training_runs import schedule_overrides
 from rtgs.config.compose import compose
 from rtgs.mesh.container import ObjectMesh
 from rtgs.mesh.triangles import TriangleMesh
-from rtgs.methods import Stage, create_method
-from rtgs.methods.transmittance import TransmissiveMethod
+from rtgs.methods import Mode, Stage, create_method
+from rtgs.methods.model import Model
 from rtgs.scenes.scene import Scene, View, load_scene
 from rtgs.train.seeds import generator_for
 from rtgs.train.trainer import Trainer
@@ -55,18 +55,16 @@ def trimmed(view: View, share: float) -> View:
     return replace(view, mask=mask.reshape(view.mask.shape))
 
 
-def trained_pair(
-    name: str, steps: int, settle: int, more: Sequence[str]
-) -> tuple[TransmissiveMethod, TransmissiveMethod, Scene, int]:
+def trained_pair(name: str, steps: int, settle: int, more: Sequence[str]) -> tuple[Model, Model, Scene, int]:
     """The method in its second and in its third stage from the same state; the scene; the step they are at."""
     words = [f"scene={name}", "method=rtgs", "preset=quick", *schedule_overrides(steps, "quick"), *EVERY_PIXEL]
     config, _ = compose([*words, "method.loss.perceptual=0", *more])
     scene = replace(load_scene(config.scene), test=())
 
-    def new(mesh: ObjectMesh | None) -> TransmissiveMethod:
+    def new(mesh: ObjectMesh | None) -> Model:
         generator = generator_for(config.seed, "initialise")
         method = create_method(config.method, scene, config.schedule, generator, mesh)
-        assert isinstance(method, TransmissiveMethod)
+        assert isinstance(method, Model)
         return method
 
     first = new(None)
@@ -81,11 +79,11 @@ def trained_pair(
     return first, third, scene, until
 
 
-def one_step(method: TransmissiveMethod, view: View, step: int) -> None:
+def one_step(method: Model, view: View, step: int) -> None:
     """A step as the trainer makes it; ``step`` is odd, so that density control leaves the sets alone."""
-    rendered = method.render(view.camera, step, None, view.mask)
+    rendered = method.render(view.camera, step, Mode.TRAIN, mask=view.mask)
     method.losses(rendered, view, step).total.backward()
-    method.after_step(step)
+    method.after_step(step, rendered.observations)
 
 
 def cpu_milliseconds(work: Callable[[], None]) -> float:

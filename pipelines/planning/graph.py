@@ -5,7 +5,6 @@ Pure: from a config to steps with parameters; nothing runs here. Each step is gi
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 
 from pipelines.planning.mask_plan import draws_panes
@@ -21,30 +20,21 @@ from pipelines.steps import (
     report,
     sfm,
     synthesize,
-    train_diffuse,
-    train_reflection,
-    train_transmittance,
+    train,
 )
 from pipelines.steps.training import StageParams
 from rtgs.config.schema import Choices, RunConfig
-from rtgs.methods import has_third_stage, method_stages, stage_settings
+from rtgs.methods import find_method
 from rtgs.train.settings import MethodSettings, ScheduleSettings
 from rtgs.workflow import Step, StepKind
 from rtgs.workflow.fingerprint import flatten
-
-TRAINING: Mapping[str, StepKind] = {
-    "diffuse": train_diffuse.STEP,
-    "reflection": train_reflection.STEP,
-    "transmittance": train_transmittance.STEP,
-}
-"""The step that runs a stage, by the name the method gives it."""
 
 KINDS: tuple[StepKind, ...] = (
     sfm.STEP,
     masks.STEP,
     normals.STEP,
     import_scene.STEP,
-    *TRAINING.values(),
+    *train.training_kinds(),
     extract_mesh.STEP,
     render.STEP,
     evaluate.STEP,
@@ -117,7 +107,8 @@ def _left_out(config: RunConfig, transparency: Transparency, object_mesh: Step |
     if object_mesh is None:
         late = "method.transmittance.start leaves it no step"
         why = late if transparency.present else transparency.why
-        return (SkippedStep("train_transmittance", why),) if config.method.name == "rtgs" else ()
+        left = next((stage for stage in find_method(config.method.name).stages if stage.needs_object), None)
+        return () if left is None else (SkippedStep(train.kind_of(left).name, why),)
     if config.mesh.extract:
         return (
             SkippedStep("scene mesh", "extract_mesh makes the transparent object's mesh, which the third stage needs"),
@@ -131,15 +122,16 @@ def _training(config: RunConfig, prepared: Preparation, transparent: bool) -> tu
     method: MethodSettings = replace(config.method, paper_schedule=ScheduleSettings())  # a preset has read it by now
     steps: list[Step] = []
     object_mesh = None
-    for stage in method_stages(method, config.schedule, transparent=transparent):
-        own = stage_settings(method, stage.name)  # so that runs that differ elsewhere share the stage
-        params = StageParams(own, config.schedule, config.seed, stage.name, stage.from_step, stage.until)
-        if stage.name == "transmittance":
-            read = (*(step for step in prepared.steps if draws_panes(step)), scene, *steps)
-            object_mesh = extract_mesh.STEP.step(extract_mesh.object_params(config), *read)
-            steps.append(TRAINING[stage.name].step(params, scene, *steps, object_mesh))
-        else:
-            steps.append(TRAINING[stage.name].step(params, scene, *steps))
+    spec = find_method(method.name)
+    for stage in spec.timeline(method, config.schedule, transparent=transparent):
+        own = spec.stage(stage.name)
+        read = own.reads(method)  # so that runs that differ elsewhere share the stage
+        params = StageParams(read, config.schedule, config.seed, stage.name, stage.from_step, stage.until)
+        if own.needs_object:
+            drawn = (step for step in prepared.steps if draws_panes(step))
+            object_mesh = extract_mesh.STEP.step(extract_mesh.object_params(config), *drawn, scene, *steps)
+        mesh = () if object_mesh is None else (object_mesh,)
+        steps.append(train.train_step(spec, params, scene, *steps, *mesh))
     return tuple(steps), object_mesh
 
 
@@ -177,7 +169,7 @@ def _report_params(config: RunConfig, choices: Choices, skipped: tuple[SkippedSt
 
 def shown_values(config: RunConfig) -> dict[str, object]:
     """Every value that has to do with the result, by dotted key."""
-    meshed = config.mesh.extract or has_third_stage(config.method)
+    meshed = config.mesh.extract or find_method(config.method.name).object_stage(config.method) is not None
     hidden = _NOT_SHOWN if meshed else (*_NOT_SHOWN, "mesh.")
     return {key: value for key, value in flatten(asdict(config)).items() if not key.startswith(hidden)}
 

@@ -87,10 +87,16 @@ def _no_glass(source: Source) -> str:
 
 
 def _reads_masks(config: RunConfig) -> bool:
-    from rtgs.methods import method_stages
+    from rtgs.methods import find_method
 
-    stages = {stage.name for stage in method_stages(config.method, config.schedule, transparent=True)}
-    return config.method.loss.specular > 0 or config.mesh.only_masked or "transmittance" in stages
+    method = find_method(config.method.name)
+    stages = {stage.name for stage in method.timeline(config.method, config.schedule, transparent=True)}
+    object_stage = method.object_stage(config.method)
+    return (
+        config.method.loss.specular > 0
+        or config.mesh.only_masked
+        or (object_stage is not None and object_stage.name in stages)
+    )
 
 
 def _refuse_early_forms(config: RunConfig, source: Source) -> None:

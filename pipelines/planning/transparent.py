@@ -8,7 +8,7 @@ from typing import NamedTuple
 from pipelines.planning.preparation import Preparation
 from rtgs.config.schema import RunConfig
 from rtgs.mesh.settings import COVERED
-from rtgs.methods import has_third_stage
+from rtgs.methods import find_method
 from rtgs.prepare.source import find_source
 
 
@@ -26,7 +26,7 @@ def find_transparency(config: RunConfig, prepared: Preparation) -> Transparency:
     Raises:
         CaptureError: a mask cannot be read.
     """
-    if not has_third_stage(config.method):
+    if find_method(config.method.name).object_stage(config.method) is None:
         return Transparency(False, "method.transmittance.enabled=false")
     if any(step.name == "masks" for step in prepared.steps):
         return Transparency(True, "masks are made")

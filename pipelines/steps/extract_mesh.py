@@ -216,7 +216,7 @@ def _median_depths(method: Method, step: int, scene: Scene) -> list[Tensor]:
     """(H, W) depth of the base set in every training view, the median where the method has one; 0 where nothing is."""
     import torch
 
-    from rtgs.methods import RenderOptions
+    from rtgs.methods import Mode, RenderOptions
     from rtgs.train.losses import surface_depth
 
     median = "median_depth" in method.maps
@@ -226,7 +226,9 @@ def _median_depths(method: Method, step: int, scene: Scene) -> list[Tensor]:
             depths.append(torch.zeros(view.camera.height, view.camera.width))
             continue
         with torch.no_grad():
-            buffers = method.render(view.camera, step, RenderOptions(depth=True, median_depth=median)).buffers
+            buffers = method.render(
+                view.camera, step, Mode.EVALUATE, RenderOptions(depth=True, median_depth=median)
+            ).buffers
         assert buffers.depth is not None
         depth = surface_depth(buffers.depth, buffers.alpha, buffers.median_depth, 1.0 if median else 0.0)
         depths.append(torch.where(torch.isfinite(depth) & (buffers.alpha >= 0.5), depth, 0.0).float())
@@ -238,17 +240,17 @@ def _depth_views(method: Method, step: int, scene: Scene, params: ExtractMeshPar
     import torch
 
     from rtgs.mesh.tsdf import DepthView
-    from rtgs.methods import RenderOptions
+    from rtgs.methods import Mode, RenderOptions
     from rtgs.train.losses import surface_depth
 
     if params.depth_ratio > 0 and "median_depth" not in method.maps:
-        raise RtgsError(f"method {method.settings.name} has no median depth: mesh.depth_ratio must be 0")
+        raise RtgsError(f"method {method.name} has no median depth: mesh.depth_ratio must be 0")
     options = RenderOptions(depth=True, median_depth=params.depth_ratio > 0)
     for view in scene.train:
         if params.only_masked and view.mask is None:
             continue
         with torch.no_grad():
-            rendered = method.render(view.camera, step, options)
+            rendered = method.render(view.camera, step, Mode.EVALUATE, options)
         buffers = rendered.buffers
         assert buffers.depth is not None
         depth = surface_depth(buffers.depth, buffers.alpha, buffers.median_depth, params.depth_ratio)

@@ -102,11 +102,11 @@ class TrainingPictures:
 def _rendered(method: Method, view: View, step: int) -> dict[str, Tensor]:
     import torch
 
-    from rtgs.methods import RenderOptions
+    from rtgs.methods import Mode, RenderOptions
 
     with torch.no_grad():
         options = RenderOptions(depth=True, normal="normal" in method.maps, layers=True)
-        rendered = method.render(view.camera, step, options, view.mask)
+        rendered = method.render(view.camera, step, Mode.EVALUATE, options, view.mask)
         return {"image": rendered.image, **view_maps(rendered)}
 
 

@@ -39,7 +39,7 @@ def render(params: RenderParams, context: StepContext) -> None:
     from safetensors.torch import save_file
 
     from rtgs.evaluate.images import file_stem, to_bytes, write_png
-    from rtgs.methods import RenderOptions
+    from rtgs.methods import Mode, RenderOptions
     from rtgs.scenes.canonical import read_scene
 
     scene = read_scene(context.inputs["import_scene"])
@@ -50,16 +50,18 @@ def render(params: RenderParams, context: StepContext) -> None:
         stem = file_stem(view.name)
         with torch.no_grad():
             start = time.perf_counter()
-            rendered = method.render(view.camera, stage.until, RenderOptions(), view.mask)
+            rendered = method.render(view.camera, stage.until, Mode.EVALUATE, RenderOptions(), view.mask)
             seconds[view.name] = time.perf_counter() - start
             image = rendered.image
             tensors = {"image": image.contiguous()}
             if rendered.transparent is not None and view.mask is not None:
                 given = RenderOptions(masks="given")
-                tensors[GIVEN] = method.render(view.camera, stage.until, given, view.mask).image.contiguous()
+                tensors[GIVEN] = method.render(
+                    view.camera, stage.until, Mode.EVALUATE, given, view.mask
+                ).image.contiguous()
             if params.maps:
                 options = RenderOptions(depth=True, normal="normal" in method.maps, layers=True)
-                tensors |= view_maps(method.render(view.camera, stage.until, options, view.mask))
+                tensors |= view_maps(method.render(view.camera, stage.until, Mode.EVALUATE, options, view.mask))
         save_file(tensors, context.out / "views" / f"{stem}.safetensors")
         write_png(context.out / "images" / f"{stem}.png", to_bytes(image))
     (context.out / TIMES_FILE).write_text(json.dumps({"seconds": seconds}, indent=1) + "\n", encoding="utf-8")

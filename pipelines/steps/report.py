@@ -9,8 +9,9 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipelines.steps import extract_mesh, train_transmittance
+from pipelines.steps import extract_mesh
 from pipelines.steps.evaluate import TABLE_JSON
+from pipelines.steps.train import BOUNDARY_FILE
 from pipelines.steps.training import last_training, read_history, read_summary
 from pipelines.steps.views import read_render
 from rtgs.workflow import StepContext, StepKind
@@ -126,7 +127,7 @@ def _boundary(training: Path) -> list[Decision]:
     from rtgs.evaluate.boundary import BoundaryScores
     from rtgs.report.page import Decision
 
-    path = training / train_transmittance.BOUNDARY_FILE
+    path = training / BOUNDARY_FILE
     if not path.is_file():
         return []
     scores = json.loads(path.read_text(encoding="utf-8"))

@@ -19,7 +19,7 @@ from rtgs.workflow.manifest import Manifest
 
 if TYPE_CHECKING:
     from rtgs.mesh.container import ObjectMesh
-    from rtgs.methods import Method
+    from rtgs.methods.model import Model
     from rtgs.scenes.scene import Scene
 
 CHECKPOINT_FOLDER = "checkpoint"
@@ -40,7 +40,7 @@ class StageParams:
     until: int
 
 
-def train_stage(params: StageParams, context: StepContext, object_mesh: ObjectMesh | None = None) -> Method:
+def train_stage(params: StageParams, context: StepContext, object_mesh: ObjectMesh | None = None) -> Model:
     """Train from ``from_step`` to ``until`` on the scene, going on from a checkpoint of a killed attempt.
 
     Writes ``checkpoint/`` (state of the method at the end), ``<set>.ply`` for every set of surfels, ``summary.json``,
@@ -82,8 +82,8 @@ def train_stage(params: StageParams, context: StepContext, object_mesh: ObjectMe
     if object_mesh is not None:
         (context.out / OBJECT_FOLDER).mkdir()
         write_object_mesh(context.out / OBJECT_FOLDER, object_mesh)
-    for surfel_set in method.sets:
-        write_ply(context.out / f"{surfel_set.name}.ply", surfel_set.surfels)
+    for part in method.sets:
+        write_ply(context.out / f"{part.name}.ply", part.gaussians)
     record = {key: _finite(value) for key, value in asdict(summary).items()}
     (context.out / SUMMARY_FILE).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
     recorder.write_history(context.out / HISTORY_FILE)
@@ -160,7 +160,7 @@ def stage_params(folder: Path) -> StageParams:
     return build(StageParams, manifest.params)
 
 
-def load_method(folder: Path, scene: Scene) -> tuple[Method, StageParams]:
+def load_method(folder: Path, scene: Scene) -> tuple[Model, StageParams]:
     """The method as it was at the end of a training stage, with the object mesh that the artifact carries."""
     from rtgs.mesh.container import read_object_mesh
     from rtgs.methods import create_method

@@ -12,12 +12,12 @@ from torch import Tensor
 from rtgs.evaluate.surface import DEPTH_TOLERANCE, NORMAL_TOLERANCE, surface_errors
 from rtgs.mesh.container import ObjectGuide, ObjectMesh
 from rtgs.mesh.silhouettes import bounding
-from rtgs.methods.base import RenderedView, RenderOptions
 from rtgs.train.losses import surface_depth
+from rtgs.train.method import Mode, RenderedView, RenderOptions
 
 if TYPE_CHECKING:
-    from rtgs.methods.base import Method
     from rtgs.scenes.scene import Scene, View
+    from rtgs.train.method import Method
 
 RENDERED_VIEWS = 12  # about so many training views are rendered for their k_s
 
@@ -78,7 +78,7 @@ def _with_truth(views: Iterable[View]) -> list[View]:
 def _rendered(method: Method, view: View, step: int) -> RenderedView:
     options = RenderOptions(depth=True, normal="normal" in method.maps)
     with torch.no_grad():
-        return method.render(view.camera, step, options, view.mask)
+        return method.render(view.camera, step, Mode.EVALUATE, options, view.mask)
 
 
 def _against_truth(method: Method, view: View, guide: ObjectGuide, step: int) -> tuple[Tensor, Tensor, Tensor]:

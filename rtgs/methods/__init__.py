@@ -1,28 +1,33 @@
-"""The systems of the tables: one file each, created by the name that the config gives. Loads no torch by itself."""
+"""The systems of the tables: a module and a YAML file each. Loads no torch by itself.
+
+A method is a value, :class:`MethodSpec`; :func:`create_method` composes what trains from it and a scene.
+"""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rtgs.methods.base import (
-    Decision,
-    LossTerm,
-    LossTerms,
+from rtgs.methods.registry import find_method, method_names, own_methods
+from rtgs.methods.spec import MethodSpec, StageSpec
+from rtgs.train.method import (
+    LossValue,
+    LossValues,
     Method,
+    Mode,
+    Observation,
     RenderedView,
     RenderOptions,
     SpecularLayers,
     Stage,
     StepEvent,
 )
-from rtgs.methods.stages import METHOD_NAMES, check_name, has_third_stage, method_stages, stage_settings
 from rtgs.train.settings import MethodSettings, ScheduleSettings
 
 if TYPE_CHECKING:
     import torch
 
     from rtgs.mesh.container import ObjectMesh
-    from rtgs.methods.surfel_base import SurfelMethod
+    from rtgs.methods.model import Model
     from rtgs.scenes.scene import Scene
 
 
@@ -32,59 +37,43 @@ def create_method(
     schedule: ScheduleSettings,
     generator: torch.Generator,
     object_mesh: ObjectMesh | None = None,
-) -> Method:
-    """The method ``settings.name``, its surfels initialised from the scene's points.
+) -> Model:
+    """The model of the method ``settings.name``, its base set initialised from the scene's points.
 
     ``schedule`` decides when losses and density control are on; ``generator`` is drawn from at initialisation and by
-    density control, and its state travels in checkpoints. ``object_mesh``: of the scene's transparent object, for the
-    third stage of methods that have one.
+    density control, and its state travels in checkpoints. ``object_mesh``: of the scene's transparent object, for
+    methods with a stage that needs it.
 
     Raises:
         ValueError: no method has this name, or it cannot use a mesh.
     """
-    kind = _method_class(settings)
-    if object_mesh is None:
-        return kind(settings, scene, schedule, generator)
-    if not has_third_stage(settings):
-        raise ValueError(f"method {settings.name} has no stage that takes an object mesh; method=rtgs has")
-    from rtgs.methods.transmittance import TransmissiveMethod
+    from rtgs.methods.model import Setup
+    from rtgs.methods.parts.pixel_bound import bound_by_pixels
 
-    assert issubclass(kind, TransmissiveMethod)
-    return kind(settings, scene, schedule, generator, object_mesh)
-
-
-def _method_class(settings: MethodSettings) -> type[SurfelMethod]:
-    check_name(settings)
-    if settings.name == "2dgs":
-        from rtgs.methods.gs2d import Gs2d
-
-        return Gs2d
-    if settings.name == "3dgs":
-        from rtgs.methods.gs3d import Gs3d
-
-        return Gs3d
-    if settings.name == "envgs":
-        from rtgs.methods.envgs import EnvGs
-
-        return EnvGs
-    from rtgs.methods.rtgs import RtGs
-
-    return RtGs
+    spec = find_method(settings.name)
+    if object_mesh is not None and spec.object_stage(settings) is None:
+        raise ValueError(f"method {spec.name} has no stage that takes an object mesh; method=rtgs has")
+    pixels = max((view.camera.width * view.camera.height for view in scene.train), default=0)
+    settings, lowered = bound_by_pixels(settings, pixels)
+    stages = spec.timeline(settings, schedule, transparent=object_mesh is not None)
+    return spec.build(Setup(spec, settings, scene, schedule, generator, object_mesh, stages, lowered))
 
 
 __all__ = [
-    "METHOD_NAMES",
-    "Decision",
-    "LossTerm",
-    "LossTerms",
+    "LossValue",
+    "LossValues",
     "Method",
+    "MethodSpec",
+    "Mode",
+    "Observation",
     "RenderOptions",
     "RenderedView",
     "SpecularLayers",
     "Stage",
+    "StageSpec",
     "StepEvent",
     "create_method",
-    "has_third_stage",
-    "method_stages",
-    "stage_settings",
+    "find_method",
+    "method_names",
+    "own_methods",
 ]

@@ -4,69 +4,27 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import torch
-
-from rtgs.core.cameras import Camera
-from rtgs.gaussians.ellipsoids import Ellipsoids
-from rtgs.methods.base import RenderOptions
-from rtgs.methods.surfel_base import SurfelMethod
-from rtgs.render.buffers import EllipsoidOptions, RasterBuffers
-from rtgs.render.ellipsoids import rasterize_ellipsoids
-from rtgs.train.settings import MethodSettings, ScheduleSettings
+from rtgs.methods.family import DIFFUSE
+from rtgs.methods.spec import MethodSpec
 
 if TYPE_CHECKING:
-    from rtgs.scenes.scene import Scene
+    from rtgs.methods.model import Model, Setup
 
 
-class Gs3d(SurfelMethod):
-    """3D Gaussian Splatting: the first stage of the surfel methods with ellipsoids, and without losses on surfaces."""
+def build(setup: Setup) -> Model:
+    """A base set of ellipsoids, shown as it is rasterised.
 
-    kind = Ellipsoids
-    maps = ("depth",)
+    Raises:
+        ValueError: a loss is on that needs a surface.
+    """
+    from rtgs.methods.losses import mcmc_terms, refuse_surface_losses, surface_terms
+    from rtgs.methods.model import Model
+    from rtgs.methods.parts.base import BaseSet
+    from rtgs.methods.parts.kinds import ELLIPSOIDS
 
-    def __init__(
-        self, settings: MethodSettings, scene: Scene, schedule: ScheduleSettings, generator: torch.Generator
-    ) -> None:
-        """Raises ValueError where a loss is on that needs a surface."""
-        for name in ("normal", "mono_normal", "distortion"):
-            if weight := getattr(settings.loss, name):
-                raise ValueError(
-                    f"method.loss.{name}={weight:g}, but the ellipsoids of method {settings.name} have no surface to "
-                    "compare with: set it to 0, or use method=2dgs"
-                )
-        super().__init__(settings, scene, schedule, generator)
+    refuse_surface_losses(setup.settings)
+    base = BaseSet(setup, ELLIPSOIDS)
+    return Model(setup, (base,), (*surface_terms(setup), *mcmc_terms(base, setup)))
 
-    def rasterize_base(self, camera: Camera, step: int, options: RenderOptions | None) -> RasterBuffers:
-        """Rasterise the base set: its SH colours as features.
 
-        Raises:
-            ValueError: a map is asked for that ellipsoids do not have.
-        """
-        watched = self.watched(step, options)
-        wanted = self.training_options(step) if options is None else options
-        if lacking := [name for name in ("median_depth", "normal", "distortion") if getattr(wanted, name)]:
-            raise ValueError(f"method {self.settings.name} renders no {', '.join(lacking)}: ellipsoids have no surface")
-        ellipsoids = self.base.activated(camera.center.float(), self.sh_degree(step))
-        probe = self.base.new_probe() if watched else None
-        render = self.settings.render
-        buffers = rasterize_ellipsoids(
-            ellipsoids.means,
-            ellipsoids.tangent_u,
-            ellipsoids.tangent_v,
-            ellipsoids.scales,
-            ellipsoids.opacities,
-            ellipsoids.colors,
-            camera,
-            background=self._background,
-            options=EllipsoidOptions(
-                near=render.near * self.extent,
-                dilation=render.dilation,
-                antialiased=render.antialiased,
-                depth=wanted.depth,
-                weight_sum=watched,
-            ),
-            screen_probe=probe,
-        )
-        if probe is not None and buffers.weight_sum is not None:
-            self.base.watch(probe, buffers.weight_sum)
-        return RasterBuffers(buffers.features, buffers.alpha, buffers.depth, weight_sum=buffers.weight_sum)
+SPEC = MethodSpec("3dgs", (DIFFUSE,), build)

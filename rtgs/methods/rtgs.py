@@ -1,9 +1,39 @@
-"""RT-GS: the diffuse base set, then reflection with the microfacet weight, then transmittance (method.md 6.2)."""
+"""RT-GS: the diffuse base set, then reflection with the microfacet weight, then transmittance (method.md 6.2).
+
+Its numbers are in conf/method/rtgs.
+"""
 
 from __future__ import annotations
 
-from rtgs.methods.transmittance import TransmissiveMethod
+from typing import TYPE_CHECKING
+
+from rtgs.methods.family import DIFFUSE, REFLECTION, TRANSMITTANCE
+from rtgs.methods.spec import GLASS, MICROFACET, MIRROR, SURFACE, MethodSpec
+
+if TYPE_CHECKING:
+    from rtgs.methods.model import Model, Setup
 
 
-class RtGs(TransmissiveMethod):
-    """RT-GS; its numbers are in conf/method/rtgs."""
+def build(setup: Setup) -> Model:
+    """A base set with materials, a traced reflection set, and in transparent objects a traced transmittance set."""
+    from rtgs.methods.losses import glass_terms, mcmc_terms, perceptual_terms, specular_terms, surface_terms
+    from rtgs.methods.model import Model
+    from rtgs.methods.parts.base import BaseSet
+    from rtgs.methods.parts.glass import Glass
+    from rtgs.methods.parts.kinds import SURFELS
+    from rtgs.methods.parts.mirror import Mirror
+
+    base = BaseSet(setup, SURFELS)
+    mirror = Mirror(setup, base)
+    glass = Glass(setup, base, mirror)
+    terms = (
+        *surface_terms(setup),
+        *mcmc_terms(base, setup),
+        *perceptual_terms(setup),
+        *specular_terms(setup, glass.mask),
+        *glass_terms(setup, glass),
+    )
+    return Model(setup, (base, mirror, glass), terms)
+
+
+SPEC = MethodSpec("rtgs", (DIFFUSE, REFLECTION, TRANSMITTANCE), build, frozenset({SURFACE, MIRROR, MICROFACET, GLASS}))

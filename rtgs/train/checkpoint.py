@@ -20,7 +20,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from rtgs.core.errors import RtgsError
-from rtgs.train.settings import MethodSettings, ScheduleSettings
+from rtgs.train.settings import ScheduleSettings
 
 FORMAT = 1
 TENSORS_FILE = "state.safetensors"
@@ -63,7 +63,7 @@ class Checkpoint:
 class RunSettings:
     """What a run must share with the checkpoint it goes on from."""
 
-    method: MethodSettings
+    method: object  # what the stage reads of the method's settings, a dataclass
     schedule: ScheduleSettings
     seed: int
 
@@ -187,13 +187,17 @@ def load_newest(folder: Path, *, warn: Callable[[str], None]) -> Checkpoint | No
     return None
 
 
-def check_resumable(record: CheckpointRecord, now: CheckpointRecord, *, warn: Callable[[str], None]) -> None:
-    """Compare a checkpoint with the run that wants to go on from it (``now``: the same facts of this process).
+def check_resumable(
+    record: CheckpointRecord, now: CheckpointRecord, settings: RunSettings, *, warn: Callable[[str], None]
+) -> None:
+    """Compare a checkpoint with the run that wants to go on from it (``now``: the same facts of this process, made of
+    ``settings``).
 
     Raises:
         CheckpointError: other settings or another scene: going on would mix two experiments.
     """
-    if record.settings_digest != now.settings_digest and (differences := _differences(record.settings, now.settings)):
+    same = record.settings_digest == now.settings_digest
+    if differences := [] if same else _differences(record.settings, now.settings, settings):
         raise CheckpointError(
             f"the checkpoint was written with other settings: {'; '.join(differences)}. Use the same settings, or "
             "another output folder"
@@ -216,7 +220,7 @@ def check_resumable(record: CheckpointRecord, now: CheckpointRecord, *, warn: Ca
         warn(f"resuming, but no longer bit for bit what an uninterrupted run gives: {', '.join(changed)}")
 
 
-def _differences(old: str, new: str) -> list[str]:
+def _differences(old: str, new: str, settings: RunSettings) -> list[str]:
     """The first few settings that differ, as 'key: old then, new now'; see :func:`_added_settings` for newer keys."""
 
     def flat(value: object, prefix: str = "") -> dict[str, object]:
@@ -228,7 +232,7 @@ def _differences(old: str, new: str) -> list[str]:
             return {prefix: value}
         return {key: leaf for name, child in items for key, leaf in flat(child, f"{prefix}.{name}".lstrip(".")).items()}
 
-    added = dict(_added_settings(RunSettings(MethodSettings(), ScheduleSettings(), 0)))
+    added = dict(_added_settings(settings))
     before, after = ({**added, **flat(json.loads(text))} for text in (old, new))
     keys = [key for key in sorted(before.keys() | after.keys()) if before.get(key) != after.get(key)]
     shown = [f"{key}: {before.get(key)} then, {after.get(key)} now" for key in keys[:5]]

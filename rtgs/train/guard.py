@@ -12,8 +12,7 @@ from torch import Tensor
 from rtgs.core.errors import RtgsError
 
 if TYPE_CHECKING:
-    from rtgs.methods.base import LossTerms, Method
-    from rtgs.methods.surfel_set import SurfelSet
+    from rtgs.train.method import LossValues, Method, Trained
 
 SHOWN = 5
 
@@ -63,7 +62,7 @@ class TrainingDiverged(RtgsError):
         super().__init__("\n".join(lines))
 
 
-def check_loss(terms: LossTerms, method: Method, step: int, view: str) -> float:
+def check_loss(terms: LossValues, method: Method, step: int, view: str) -> float:
     """The loss as a number. One scalar read when all is well.
 
     Raises:
@@ -76,7 +75,7 @@ def check_loss(terms: LossTerms, method: Method, step: int, view: str) -> float:
     raise diverged(terms, method, step, view)
 
 
-def diverged(terms: LossTerms, method: Method, step: int, view: str, *, cause: str = "") -> TrainingDiverged:
+def diverged(terms: LossValues, method: Method, step: int, view: str, *, cause: str = "") -> TrainingDiverged:
     """The report of a step whose loss or gradients (still in ``.grad``) are not finite."""
     bad = tuple(term.name for term in terms.terms if not math.isfinite(term.value))
     values = tuple((term.name, term.value) for term in terms.terms)
@@ -86,8 +85,8 @@ def diverged(terms: LossTerms, method: Method, step: int, view: str, *, cause: s
 def _bad_surfels(method: Method) -> tuple[BadSurfels, ...]:
     """Every parameter and gradient with non-finite rows."""
     found = []
-    for part in method.sets:
-        for name, tensor in part.surfels.items():
+    for part in (*method.sets, *method.groups):
+        for name, tensor in part.tensors():
             for label, values in ((name, tensor.detach()), (f"gradient of {name}", tensor.grad)):
                 bad = _describe(part, label, values)
                 if bad is not None:
@@ -95,10 +94,10 @@ def _bad_surfels(method: Method) -> tuple[BadSurfels, ...]:
     return tuple(found)
 
 
-def _describe(part: SurfelSet, label: str, values: Tensor | None) -> BadSurfels | None:
+def _describe(part: Trained, label: str, values: Tensor | None) -> BadSurfels | None:
     if values is None:
         return None
-    rows = values.reshape(len(values), -1)
+    rows = values.reshape(len(values) if values.ndim else 1, -1)
     ids = (~torch.isfinite(rows).all(dim=1)).nonzero()[:, 0]
     if len(ids) == 0:
         return None

@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 import rtgs
-from rtgs.methods.base import Decision, LossTerm, Method, RenderOptions, Stage, StepEvent
-from rtgs.methods.stages import stage_settings
+from rtgs.core.decisions import Decision
 from rtgs.native import core
 from rtgs.scenes.scene import Scene
 from rtgs.train.checkpoint import (
@@ -31,6 +30,7 @@ from rtgs.train.checkpoint import (
 from rtgs.train.clock import Clock, ElapsedTime
 from rtgs.train.guard import check_loss, diverged
 from rtgs.train.memory import peak_memory_mb, start_peak_memory
+from rtgs.train.method import LossValue, Method, Mode, Stage, StepEvent
 from rtgs.train.progress import Progress, SilentProgress, StepReport
 from rtgs.train.seeds import seed_for
 from rtgs.train.view_order import OrderState, ViewOrder
@@ -116,9 +116,10 @@ class Trainer:
         self._step = self.stage.from_step
         self._elapsed_before = ElapsedTime()
         self._clock = Clock()
-        self._window: list[tuple[LossTerm, ...]] = []
+        self._window: list[tuple[LossValue, ...]] = []
         self._seed = seed
-        self._settings = self._settings_of(self.stage)
+        self._run = self._settings_of(self.stage)
+        self._settings = canonical_json(self._run)
         self._scene_digest = scene_digest(scene)
 
     def run(self) -> TrainSummary:
@@ -163,7 +164,7 @@ class Trainer:
         """Mean PSNR over the test views at the present step, images clamped to [0, 1]."""
         with torch.no_grad():
             values = [
-                _psnr(self.method.render(view.camera, self._step, RenderOptions(), view.mask).image, view.image)
+                _psnr(self.method.render(view.camera, self._step, Mode.EVALUATE, mask=view.mask).image, view.image)
                 for view in self.scene.test
             ]
         return sum(values) / len(values)
@@ -180,12 +181,12 @@ class Trainer:
         """Render, loss, backward, Adam, density control: one step on one view."""
         step = self._step
         view = self.scene.train[self._order.next()]
-        rendered = self.method.render(view.camera, step, None, view.mask)
+        rendered = self.method.render(view.camera, step, Mode.TRAIN, mask=view.mask)
         terms = self.method.losses(rendered, view, step)
         loss = check_loss(terms, self.method, step, view.name)
         terms.total.backward()
         try:
-            events = self.method.after_step(step)
+            events = self.method.after_step(step, rendered.observations)
         except FloatingPointError as error:  # of Adam or of density control
             raise diverged(terms, self.method, step, view.name, cause=str(error)) from error
         self._note(step + 1, events)
@@ -248,7 +249,7 @@ class Trainer:
         if checkpoint is None:
             return None
         record, tensors = checkpoint.record, checkpoint.tensors
-        check_resumable(record, self._expected_record(record.step), warn=self.progress.note)
+        check_resumable(record, self._expected_record(record.step), self._run, warn=self.progress.note)
         prefix = "method."
         self.method.load({name[len(prefix) :]: t for name, t in tensors.items() if name.startswith(prefix)})
         self._order.load(OrderState(tensors["views.permutation"], record.order_position, tensors["views.generator"]))
@@ -257,9 +258,8 @@ class Trainer:
         self._elapsed_before = ElapsedTime(record.elapsed, record.elapsed_cpu)
         return record.step
 
-    def _settings_of(self, stage: Stage) -> str:
-        settings = stage_settings(self.method.settings, stage.name)
-        return canonical_json(RunSettings(settings, self.method.schedule, self._seed))
+    def _settings_of(self, stage: Stage) -> RunSettings:
+        return RunSettings(self.method.recipe(stage.name), self.method.schedule, self._seed)
 
     def _expected_record(self, step: int) -> CheckpointRecord:
         """What a checkpoint of ``step`` must agree with: at the stage's first step it is of the stage before."""
@@ -268,7 +268,7 @@ class Trainer:
         record = self._record(0)
         if step > self.stage.from_step or before < 0:
             return record
-        settings = self._settings_of(self.method.stages[before])
+        settings = canonical_json(self._settings_of(self.method.stages[before]))
         return replace(record, settings=settings, settings_digest=digest(settings))
 
     def _record(self, order_position: int) -> CheckpointRecord:

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from benchmarks.specular_choices import CHOICES, MIRROR_BALL, ball_setting, compose_choice, row, score, trained
-from rtgs.methods.reflective import ReflectiveMethod
+from rtgs.methods.model import Model
 
 
 def options(**changes: object) -> Namespace:
@@ -39,7 +39,7 @@ def test_a_choice_is_trained_and_scored(tmp_path):
     setting = ball_setting(options(root=tmp_path))
     config = compose_choice(options(root=tmp_path, set=words), CHOICES["rtgs"])
     method, seconds = trained(config, setting.train, 0, None)
-    assert isinstance(method, ReflectiveMethod)
+    assert isinstance(method, Model)
     found = score(method, "rtgs", 0, seconds, setting)
     assert found.k_s is not None
     assert 0 < found.k_s < 1

@@ -18,7 +18,7 @@ from rtgs.gaussians.materials import (
 )
 from rtgs.gaussians.ply import read_ply, write_ply
 from rtgs.gaussians.surfels import Surfels
-from rtgs.methods.surfel_set import SurfelSet
+from rtgs.methods.parts.gaussian_set import GaussianSet
 from rtgs.train.settings import DensitySettings, OptimizerSettings
 from rtgs.train.specular_settings import MaterialSettings
 
@@ -65,20 +65,20 @@ def test_density_control_inherits_them():
 
 def test_a_set_adopts_and_drops_them_and_adam_keeps_its_moments():
     surfels = random_surfels(6).requires_grad_()
-    part = SurfelSet(
+    part = GaussianSet(
         "base", surfels, optimizer=OptimizerSettings(), density=DensitySettings(), means_lr_steps=10, extent=1.0
     )
     surfels.means.sum().backward()
     part.step(0, 0)
     moments = part.optimizer.first.means.clone()
-    part.adopt(with_materials(part.surfels, MaterialSettings()))  # type: ignore[arg-type]
+    part.adopt(with_materials(part.gaussians, MaterialSettings()))  # type: ignore[arg-type]
     assert part.optimizer.steps == 1
     assert torch.equal(part.optimizer.first.means, moments)
     assert float(part.optimizer.first.specular_logits.abs().sum()) == 0  # type: ignore[attr-defined]
-    part.surfels.specular_logits.sum().backward()  # type: ignore[attr-defined]
+    part.gaussians.specular_logits.sum().backward()  # type: ignore[attr-defined]
     part.step(1, 0)
-    assert float(part.surfels.specular_logits.detach().max()) < -6.9  # type: ignore[attr-defined]
-    part.adopt(without_materials(part.surfels))  # type: ignore[arg-type]
+    assert float(part.gaussians.specular_logits.detach().max()) < -6.9  # type: ignore[attr-defined]
+    part.adopt(without_materials(part.gaussians))  # type: ignore[arg-type]
     assert part.optimizer.steps == 2
     with pytest.raises(ValueError, match="set 'base' has 6 rows, 3 were given"):
         part.adopt(random_surfels(3))

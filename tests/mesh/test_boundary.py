@@ -10,7 +10,7 @@ from torch import Tensor
 from rtgs.core.cameras import Camera
 from rtgs.evaluate.boundary import boundary_scores
 from rtgs.mesh.container import ObjectMesh
-from rtgs.methods import RenderedView, RenderOptions
+from rtgs.methods import Mode, RenderedView, RenderOptions
 from rtgs.render.buffers import RasterBuffers
 from rtgs.scenes.scene import Scene, View
 from tests.mesh.shapes import camera_at, sphere, sphere_depths
@@ -39,7 +39,9 @@ class Painter:
 
     maps = ("depth", "normal")
 
-    def render(self, camera: Camera, step: int, options: RenderOptions, mask: Tensor | None) -> RenderedView:
+    def render(
+        self, camera: Camera, step: int, mode: Mode, options: RenderOptions, mask: Tensor | None
+    ) -> RenderedView:
         depth, normal = surface(camera)
         depth = torch.where(torch.arange(camera.height)[:, None] < ROWS, depth, 1.05 * depth)
         across = torch.nn.functional.normalize(

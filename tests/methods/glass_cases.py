@@ -14,7 +14,7 @@ from torch import Tensor
 from rtgs.mesh.container import ObjectMesh
 from rtgs.mesh.triangles import TriangleMesh
 from rtgs.methods import create_method
-from rtgs.methods.transmittance import TransmissiveMethod
+from rtgs.methods.model import Model
 from rtgs.scenes.scene import Scene, View
 from rtgs.train.seeds import generator_for
 from rtgs.train.settings import (
@@ -126,14 +126,14 @@ def new_glass_method(
     *,
     mesh: bool = True,
     seed: int = 3,
-) -> TransmissiveMethod:
+) -> Model:
     generator = generator_for(seed, "initialise")
     method = create_method(settings, made.scene, plan or schedule(), generator, made.mesh if mesh else None)
-    assert isinstance(method, TransmissiveMethod)
+    assert isinstance(method, Model)
     return method
 
 
-def train_stages(method: TransmissiveMethod, scene: Scene, *, seed: int = 3, folder: Path | None = None) -> None:
+def train_stages(method: Model, scene: Scene, *, seed: int = 3, folder: Path | None = None) -> None:
     """All stages of a method in one process."""
     before = None
     for stage in method.stages:
@@ -144,7 +144,7 @@ def train_stages(method: TransmissiveMethod, scene: Scene, *, seed: int = 3, fol
         before = trainer
 
 
-def begun(settings: MethodSettings, made: GlassScene, plan: ScheduleSettings | None = None) -> TransmissiveMethod:
+def begun(settings: MethodSettings, made: GlassScene, plan: ScheduleSettings | None = None) -> Model:
     """A method whose stages have all begun, untrained."""
     method = new_glass_method(settings, made, plan)
     for stage in method.stages:
@@ -152,14 +152,14 @@ def begun(settings: MethodSettings, made: GlassScene, plan: ScheduleSettings | N
     return method
 
 
-def randomised(method: TransmissiveMethod, seed: int = 4) -> Tensor | None:
+def randomised(method: Model, seed: int = 4) -> Tensor | None:
     """Colours that depend on direction and opaque sets, so that every parameter has a gradient."""
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
         for part in method.sets:
-            part.surfels.sh_rest += 0.1 * torch.randn(part.surfels.sh_rest.shape, generator=generator)
-            part.surfels.opacity_logits += 1.0
-        method.base.surfels.log_scales += 0.3
+            part.gaussians.sh_rest += 0.1 * torch.randn(part.gaussians.sh_rest.shape, generator=generator)
+            part.gaussians.opacity_logits += 1.0
+        method["base"].gaussians.log_scales += 0.3
     return None
 
 

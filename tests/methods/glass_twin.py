@@ -5,13 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
+from reflective_cases import training_maps
 from torch import Tensor
 
 from rtgs.core.cameras import Camera
 from rtgs.gaussians.materials import MaterialSurfels, activate_materials
 from rtgs.gaussians.surfels import ActivatedSurfels, Surfels, activate
-from rtgs.methods.mirror import SHORTEST_NORMAL, SurfacePixels, mirror_rays, pixel_weights, surface_pixels
-from rtgs.methods.transmittance import TransmissiveMethod
+from rtgs.methods.model import Model
+from rtgs.methods.parts.kinds import surfel_options
+from rtgs.methods.shading.mirror import SHORTEST_NORMAL, SurfacePixels, mirror_rays, pixel_weights, surface_pixels
 from rtgs.render.buffers import TraceBuffers, TraceOptions
 from rtgs.render.discontinuities.surfels import discontinuity_mask
 from rtgs.render.discontinuities.trace import fragile_rays
@@ -46,18 +48,18 @@ def to_srgb(light: Tensor) -> Tensor:
 class GlassTwin:
     """Reads a method's settings and plan, and none of its renderers."""
 
-    def __init__(self, method: TransmissiveMethod, sets: Sets, camera: Camera, step: int) -> None:
+    def __init__(self, method: Model, sets: Sets, camera: Camera, step: int) -> None:
         self.method, self.sets, self.camera, self.step = method, sets, camera, step
         self.settings = method.settings.transmittance
         self.fragile = torch.zeros(camera.height * camera.width, dtype=torch.bool)
 
     def render(self, inside: Tensor) -> TwinGlass:
         """The view whose pixels ``inside`` (H, W) look through the object."""
-        assert self.method.guide is not None
-        surfaces = self.method.guide.surfaces(self.camera)
+        assert self.method.parts["glass"].guide is not None
+        surfaces = self.method.parts["glass"].guide.surfaces(self.camera)
         flat, covered = self._surface()
         inside, met = inside.flatten(), inside.flatten() & surfaces.hit.flatten()
-        known = met & self.method._glass[surfaces.triangle.flatten().clamp_min(0).long()]
+        known = met & self.method.parts["glass"]._glass[surfaces.triangle.flatten().clamp_min(0).long()]
         if self.settings.first_surface == "mesh":
             flat = replace(flat, depth=torch.where(known, surfaces.near.flatten().double(), flat.depth))
         covered &= flat.depth > 0
@@ -65,7 +67,7 @@ class GlassTwin:
         view = rays.directions.reshape(-1, 3).T
         kind = self.method.settings.reflection.sh_direction
         mirrored = mirror_rays(flat, rays.origin, view, kind)
-        options = replace(self.method._trace_options(self.step, False), weight_sum=False)
+        options = replace(self.method.parts["mirror"].trace_options(self.step, False), weight_sum=False)
         everyone = torch.arange(view.shape[1])
         reflected = self._trace("reflection", mirrored.origins, mirrored.directions, options, everyone)
         weights = pixel_weights(mirrored.cosine, flat, self.method.settings.optics)
@@ -105,7 +107,8 @@ class GlassTwin:
         )
         shape = (means, tangent_u, tangent_v, scales, opacities)
         features = torch.cat([part[1] for part in parts])
-        options = self.method.raster_options(self.method.training_options(self.step), weight_sum=False)
+        wanted = training_maps(self.method, self.camera, self.step)
+        options = surfel_options(wanted, settings.render, self.method.extent, weight_sum=False)
         buffers = reference.rasterize_surfels(*shape, features, self.camera, options=options)
         assert buffers.depth is not None
         assert buffers.normal is not None
@@ -120,7 +123,7 @@ class GlassTwin:
     def _activated(self, name: str) -> tuple[ActivatedSurfels, Tensor]:
         raw = self.sets[name]
         assert isinstance(raw, MaterialSurfels)
-        surfels = activate(raw, self.camera.center, self.method.sh_degree(self.step))
+        surfels = activate(raw, self.camera.center, self.method.base.sh_degree(self.step))
         made = activate_materials(raw, self.method.settings.materials)
         return surfels, torch.cat((surfels.colors, made.specular[:, None], made.roughness[:, None], made.f0), 1)
 
@@ -138,13 +141,13 @@ class GlassTwin:
         self, center: Tensor, rays: Tensor, near: Tensor, far: Tensor, second: Tensor, rows: Tensor
     ) -> tuple[Tensor, TraceBuffers]:
         settings, method = self.settings, self.method
-        assert method.guide is not None
+        assert method.parts["glass"].guide is not None
         thickness = far - near
         options = TraceOptions(
             t_min=settings.offset * method.extent,
             transmittance_cutoff=settings.transmittance_cutoff,
             alpha_cutoff=settings.alpha_cutoff,
-            sh_degree=method.sh_degree(self.step),
+            sh_degree=method.base.sh_degree(self.step),
             depth=True,
             sh_direction=method.settings.reflection.sh_direction,  # type: ignore[arg-type]
         )
@@ -153,13 +156,13 @@ class GlassTwin:
             first = self._trace("base", origins, rays, replace(options, t_max=thickness), rows)
         else:
             bound = torch.where(second, thickness, torch.inf) if settings.first_bounce_end == "clip" else torch.inf
-            own = replace(options, t_max=bound, sh_degree=method._own_degree(self.step))
+            own = replace(options, t_max=bound, sh_degree=method.parts["glass"]._own_degree(self.step))
             first = self._trace("transmittance", origins, rays, own, rows)
         assert first.colors is not None
         assert first.depth is not None
         left = 1 - first.alpha
         back = near + first.depth.detach() if settings.second_bounce == "first_bounce" else far
-        start = settings.second_offset * method.guide.mesh.voxel / rays.norm(dim=1)
+        start = settings.second_offset * method.parts["glass"].guide.mesh.voxel / rays.norm(dim=1)
         then = replace(options, t_min=start, depth=False)
         behind = self._trace("base", center + back[:, None] * rays, rays, then, rows).colors
         assert behind is not None

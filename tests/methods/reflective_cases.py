@@ -7,8 +7,10 @@ from pathlib import Path
 
 from mirror_scene import MirrorScene, mirror_scene
 
-from rtgs.methods import create_method
-from rtgs.methods.reflective import ReflectiveMethod
+from rtgs.core.cameras import Camera
+from rtgs.methods import Mode, RenderOptions, create_method
+from rtgs.methods.model import Model
+from rtgs.methods.parts.part import Frame
 from rtgs.optics.settings import OpticsSettings
 from rtgs.train.seeds import generator_for
 from rtgs.train.settings import (
@@ -66,15 +68,15 @@ def tiny(strength: float = 0.8) -> MirrorScene:
     return mirror_scene(8, 24, 18, strength=strength, points=250, test_every=8)
 
 
-def new_method(settings: MethodSettings, made: MirrorScene, plan: ScheduleSettings, seed: int = 3) -> ReflectiveMethod:
+def new_method(settings: MethodSettings, made: MirrorScene, plan: ScheduleSettings, seed: int = 3) -> Model:
     method = create_method(settings, made.scene, plan, generator_for(seed, "initialise"))
-    assert isinstance(method, ReflectiveMethod)
+    assert isinstance(method, Model)
     return method
 
 
 def train_all(
     settings: MethodSettings, made: MirrorScene, plan: ScheduleSettings, *, folder: Path | None = None, seed: int = 3
-) -> ReflectiveMethod:
+) -> Model:
     """Both stages in one process."""
     method = new_method(settings, made, plan, seed)
     before = None
@@ -85,3 +87,18 @@ def train_all(
         trainer.run()
         before = trainer
     return method
+
+
+def training_maps(method: Model, camera: Camera, step: int) -> RenderOptions:
+    """The maps of the base set that a training view of this step is rendered with."""
+    frame = Frame(camera, step, Mode.TRAIN, RenderOptions())
+    wanted = method.loss.needs(step)
+    for part in method.parts.values():
+        wanted = wanted.plus(part.needs(frame))
+    return wanted
+
+
+def use(method: Model, settings: MethodSettings) -> None:
+    """From now on the method renders with these settings."""
+    for part in method.parts.values():
+        part.settings = settings

@@ -6,21 +6,22 @@ from dataclasses import dataclass, replace
 
 import pytest
 import torch
-from reflective_cases import new_method, recipe, schedule, tiny
+from reflective_cases import new_method, recipe, schedule, tiny, training_maps
 from torch import Tensor
 
 from rtgs.gaussians.materials import activate_materials
 from rtgs.gaussians.surfels import activate
-from rtgs.methods import Stage
-from rtgs.methods.mirror import (
+from rtgs.methods import Mode, Stage
+from rtgs.methods.model import Model
+from rtgs.methods.parts.kinds import surfel_options
+from rtgs.methods.parts.reflection_init import scene_color
+from rtgs.methods.shading.mirror import (
     SHORTEST_NORMAL,
     mirror_rays,
     pixel_weights,
     specular_change,
     surface_pixels,
 )
-from rtgs.methods.reflection_set import scene_color
-from rtgs.methods.reflective import ReflectiveMethod
 from rtgs.optics.settings import OpticsSettings
 from rtgs.render.discontinuities.surfels import discontinuity_mask
 from rtgs.render.discontinuities.trace import fragile_rays
@@ -37,14 +38,14 @@ class TwinRender:
     fragile: Tensor  # (H, W) bool: a decision lies within float32 rounding of its threshold
 
 
-def twin_render(method: ReflectiveMethod, base, reflection, camera, images) -> TwinRender:
+def twin_render(method: Model, base, reflection, camera, images) -> TwinRender:
     """What ``method.render`` computes, from float64 copies of both sets, by the readable twins alone."""
     settings = method.settings
-    surfels = activate(base, camera.center, method.sh_degree(STEP))
+    surfels = activate(base, camera.center, method.base.sh_degree(STEP))
     materials = activate_materials(base, settings.materials)
     features = torch.cat((surfels.colors, materials.specular[:, None], materials.roughness[:, None], materials.f0), 1)
     shape = (surfels.means, surfels.tangent_u, surfels.tangent_v, surfels.scales, surfels.opacities)
-    options = method.raster_options(method.training_options(STEP), weight_sum=False)
+    options = surfel_options(training_maps(method, camera, STEP), settings.render, method.extent, weight_sum=False)
     buffers = reference.rasterize_surfels(*shape, features, camera, options=options)
     assert buffers.normal is not None
     assert buffers.depth is not None
@@ -68,7 +69,7 @@ def twin_render(method: ReflectiveMethod, base, reflection, camera, images) -> T
         traced_set.scales,
         traced_set.opacities,
     )
-    trace = replace(method._trace_options(STEP, False), t_min=settings.reflection.offset * method.extent)
+    trace = replace(method.parts["mirror"].trace_options(STEP, False), t_min=settings.reflection.offset * method.extent)
     colors = {"sh_dc": reflection.sh_dc, "sh_rest": reflection.sh_rest}
     traced = reference_trace.trace_surfels(
         *traced_shape, mirrored.origins, mirrored.directions, **colors, options=trace
@@ -116,13 +117,13 @@ def test_image_and_every_gradient_are_those_of_the_twins(case: str):
     generator = torch.Generator().manual_seed(4)
     with torch.no_grad():
         for part in method.sets:
-            part.surfels.sh_rest += 0.1 * torch.randn(part.surfels.sh_rest.shape, generator=generator)
-            part.surfels.opacity_logits += 1.5
-        method.base.surfels.log_scales += 0.3
+            part.gaussians.sh_rest += 0.1 * torch.randn(part.gaussians.sh_rest.shape, generator=generator)
+            part.gaussians.opacity_logits += 1.5
+        method["base"].gaussians.log_scales += 0.3
     camera = made.scene.train[0].camera
-    base, reflection = doubled(method.sets[0].surfels), doubled(method.sets[1].surfels)
+    base, reflection = doubled(method.sets[0].gaussians), doubled(method.sets[1].gaussians)
     twin = twin_render(method, base, reflection, camera, [view.image for view in made.scene.train])
-    rendered = method.render(camera, STEP)
+    rendered = method.render(camera, STEP, Mode.TRAIN)
     clear = ~twin.fragile
     assert float(clear.double().mean()) > 0.3
     error = (rendered.image.detach().double() - twin.image.detach()).abs().amax(0)
@@ -131,7 +132,7 @@ def test_image_and_every_gradient_are_those_of_the_twins(case: str):
     (twin.image * upstream).sum().backward()
     (rendered.image * upstream.float()).sum().backward()
     for part, exact in zip(method.sets, (base, reflection), strict=True):
-        for name, tensor in part.surfels.items():
+        for name, tensor in part.gaussians.items():
             expected = getattr(exact, name).grad
             if expected is None or float(expected.abs().max()) == 0:
                 assert tensor.grad is None or float(tensor.grad.abs().max()) < 1e-6, f"{part.name}.{name}"

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from reflective_cases import new_method, recipe, schedule, tiny
 from torch import Tensor
 
-from rtgs.methods import RenderOptions, Stage
-from rtgs.methods.mirror import SHORTEST_NORMAL, SurfacePixels, mirror_rays, reflected_weight, specular_change
+from rtgs.methods import Mode, RenderOptions, Stage
+from rtgs.methods.shading.mirror import SHORTEST_NORMAL, SurfacePixels, mirror_rays, reflected_weight, specular_change
 from rtgs.optics.settings import OpticsSettings
 
 TOWARDS = torch.tensor([0.0, 0.0, -1.0])  # the camera, from what it sees straight ahead
@@ -117,20 +117,20 @@ def test_a_training_step_at_the_corners_of_the_materials(made, specular: float, 
     chosen = recipe()
     method = new_method(replace(chosen, optics=replace(chosen.optics, max_gain=16.0)), made, schedule())
     method.begin(Stage("reflection", 15, 60))
-    surfels = method.base.surfels
+    surfels = method["base"].gaussians
     with torch.no_grad():
         for logits, value in (("specular_logits", specular), ("roughness_logits", roughness), ("f0_logits", f0)):
             getattr(surfels, logits).fill_(value)
         surfels.quaternions[::4] = 0  # no direction at all
         surfels.log_scales[::5] = torch.tensor([-20.0, 1.0])  # needles
     view = made.scene.train[0]
-    rendered = method.render(view.camera, 15)
+    rendered = method.render(view.camera, 15, Mode.TRAIN)
     assert bool(rendered.image.isfinite().all())
     method.losses(rendered, view, 15).total.backward()
     for part in method.sets:
-        for key, tensor in part.surfels.items():
+        for key, tensor in part.gaussians.items():
             assert tensor.grad is None or bool(tensor.grad.isfinite().all()), f"{part.name}.{key}"
             assert tensor.grad is None or float(tensor.grad.abs().max()) < LARGEST_GRADIENT, f"{part.name}.{key}"
-    method.after_step(15)
+    method.after_step(15, rendered.observations)
     with torch.no_grad():
-        assert bool(method.render(made.scene.test[0].camera, 16, RenderOptions()).image.isfinite().all())
+        assert bool(method.render(made.scene.test[0].camera, 16, Mode.EVALUATE, RenderOptions()).image.isfinite().all())

@@ -9,17 +9,17 @@ import pytest
 import torch
 from glass_cases import GlassScene, begun, glass_recipe, glass_scene, new_glass_method, train_stages
 from mirror_scene import BALL, RADIUS, ball_hit
-from reflective_cases import schedule
+from reflective_cases import schedule, use
 from torch import Tensor
 
 from rtgs.core.cameras import Camera
 from rtgs.mesh.container import ObjectGuide, ObjectSurfaces
-from rtgs.methods import RenderOptions
-from rtgs.methods.glass import glass_pixels, widened
-from rtgs.methods.glass_evidence import glass_faces, on_surface, seen_bare
-from rtgs.methods.interface_set import normal_quaternions
-from rtgs.methods.mirror import SurfacePixels
-from rtgs.methods.transmittance import TransmissiveMethod
+from rtgs.methods import Mode, RenderOptions
+from rtgs.methods.model import Model
+from rtgs.methods.parts.glass_evidence import glass_faces, on_surface, seen_bare
+from rtgs.methods.parts.interface_set import normal_quaternions
+from rtgs.methods.shading.mirror import SurfacePixels
+from rtgs.methods.shading.straight import glass_pixels, widened
 from rtgs.scenes.scene import View
 from rtgs.train.specular_settings import InterfaceSettings
 
@@ -79,22 +79,22 @@ def test_faces_that_no_mask_shows_are_no_glass(capped: GlassScene):
 
 def test_the_interface_leaves_out_what_is_no_glass(capped: GlassScene):
     method = begun(glass_recipe(interface=VOTED), capped)
-    assert method.interface is not None
-    assert len(method.interface) == 150
-    points = method.interface.surfels.means.detach()
+    assert method.find("interface") is not None
+    assert len(method.find("interface")) == 150
+    points = method.find("interface").gaussians.means.detach()
     assert float((heights(points) > LABEL + 0.3).float().mean()) < 0.06
     whole = begun(glass_recipe(interface=replace(VOTED, masked_share=0.0)), capped)
-    assert whole.interface is not None
-    assert float((heights(whole.interface.surfels.means.detach()) > LABEL + 0.3).float().mean()) > 0.1
-    assert method.guide is not None
-    shown = [method.guide.surfaces(view.camera) for view in capped.scene.train]
-    assert all(bool(method._on_glass(surfaces).any()) for surfaces in shown)
-    assert any(bool((surfaces.hit & ~method._on_glass(surfaces)).any()) for surfaces in shown)
+    assert whole.find("interface") is not None
+    assert float((heights(whole["interface"].gaussians.means.detach()) > LABEL + 0.3).float().mean()) > 0.1
+    assert method.parts["glass"].guide is not None
+    shown = [method.parts["glass"].guide.surfaces(view.camera) for view in capped.scene.train]
+    assert all(bool(method.parts["glass"].on_glass(surfaces).any()) for surfaces in shown)
+    assert any(bool((surfaces.hit & ~method.parts["glass"].on_glass(surfaces)).any()) for surfaces in shown)
     view = capped.scene.train[0]
     again = new_glass_method(glass_recipe(interface=VOTED), capped)
     again.load(method.state())
-    assert torch.equal(again._glass, method._glass)
-    images = [m.render(view.camera, 40, RenderOptions(), view.mask).image for m in (method, again)]
+    assert torch.equal(again.parts["glass"]._glass, method.parts["glass"]._glass)
+    images = [m.render(view.camera, 40, Mode.EVALUATE, RenderOptions(), view.mask).image for m in (method, again)]
     assert torch.equal(*images)
 
 
@@ -119,21 +119,21 @@ def test_what_is_seen_bare_stays_in_the_base_set_too(capped: GlassScene):
     for stage in method.stages[:2]:
         method.begin(stage)
     with torch.no_grad():  # an opaque skin of the ball
-        method.base.surfels.means[:200] = BALL + RADIUS * torch.nn.functional.normalize(
+        method["base"].gaussians.means[:200] = BALL + RADIUS * torch.nn.functional.normalize(
             torch.randn(200, 3, generator=torch.Generator().manual_seed(1)), dim=1
         )
-        method.base.surfels.log_scales[:200] = torch.tensor(0.12 * RADIUS).log()
-        method.base.surfels.opacity_logits[:200] = 4.0
-    before = len(method.base)
-    method.settings = replace(recipe, transmittance=replace(recipe.transmittance, opaque_share=1.0))
+        method["base"].gaussians.log_scales[:200] = torch.tensor(0.12 * RADIUS).log()
+        method["base"].gaussians.opacity_logits[:200] = 4.0
+    before = len(method["base"])
+    use(method, replace(recipe, transmittance=replace(recipe.transmittance, opaque_share=1.0)))
     events = method.begin(method.stages[2])
-    assert method.transmittance is not None
-    both = len(method.base) + len(method.transmittance) - before
+    assert method.find("transmittance") is not None
+    both = len(method["base"]) + len(method.find("transmittance")) - before
     assert 10 < both < 150
     assert any(f"{both} of them seen bare too" in event.detail for event in events)
     view = capped.scene.train[0]
     with torch.no_grad():
-        method.render(view.camera, 31, None, view.mask)
+        method.render(view.camera, 31, Mode.TRAIN, mask=view.mask)
     train_stages(new_glass_method(recipe, capped, schedule(total=24, checkpoint_every=100)), capped.scene)
 
 
@@ -149,27 +149,27 @@ def test_an_opaque_thing_under_masks_is_left_alone(plain: GlassScene):
     assert [part.name for part in method.sets] == ["base", "reflection"]
     assert method.decisions[-1].what == "no transmittance stage"
     view = views[0]
-    rendered = method.render(view.camera, 40, None, view.mask)
+    rendered = method.render(view.camera, 40, Mode.TRAIN, mask=view.mask)
     assert rendered.transparent is None
     assert "specular" not in {term.name for term in method.losses(rendered, view, 40).terms}
     again = new_glass_method(glass_recipe(), plain)
     again.load(method.state())
     assert again.decisions[-1] == method.decisions[-1]
-    assert again.glass_mask(view) is None
+    assert again.parts["glass"].mask(view) is None
 
 
-def _with_skin(made: GlassScene) -> TransmissiveMethod:
+def _with_skin(made: GlassScene) -> Model:
     """Before its third stage, with an opaque ball in the place of the glass one."""
     method = new_glass_method(glass_recipe(), made)
     for stage in method.stages[:2]:
         method.begin(stage)
-    count = len(method.base)
+    count = len(method["base"])
     with torch.no_grad():
         around = torch.nn.functional.normalize(torch.randn(count, 3, generator=torch.Generator().manual_seed(1)), dim=1)
-        method.base.surfels.means.copy_(BALL + RADIUS * around)
-        method.base.surfels.quaternions.copy_(normal_quaternions(around))
-        method.base.surfels.log_scales.fill_(torch.tensor(0.2 * RADIUS).log())
-        method.base.surfels.opacity_logits.fill_(5.0)
+        method["base"].gaussians.means.copy_(BALL + RADIUS * around)
+        method["base"].gaussians.quaternions.copy_(normal_quaternions(around))
+        method["base"].gaussians.log_scales.fill_(torch.tensor(0.2 * RADIUS).log())
+        method["base"].gaussians.opacity_logits.fill_(5.0)
     return method
 
 
@@ -177,12 +177,12 @@ def test_a_mask_of_the_whole_picture_is_none(plain: GlassScene):
     method = begun(glass_recipe(), plain)
     view = plain.scene.train[0]
     covered = replace(view, mask=torch.ones(view.camera.height, view.camera.width, dtype=torch.bool))
-    assert method.glass_mask(covered) is None
-    assert method.glass_mask(view) is view.mask
-    assert method.guide is not None
-    shown = method.render(view.camera, 40, None, covered.mask).transparent
+    assert method.parts["glass"].mask(covered) is None
+    assert method.parts["glass"].mask(view) is view.mask
+    assert method.parts["glass"].guide is not None
+    shown = method.render(view.camera, 40, Mode.TRAIN, mask=covered.mask).transparent
     assert shown is not None
-    assert torch.equal(shown, method.guide.surfaces(view.camera).hit)
+    assert torch.equal(shown, method.parts["glass"].guide.surfaces(view.camera).hit)
     everywhere = GlassScene(replace(plain.scene, train=(covered,) * 4), plain.mesh)
     assert begun(glass_recipe(), everywhere).decisions[-1].why.startswith("the masks of the training views are empty")
 
@@ -192,9 +192,9 @@ def test_one_masked_view_is_enough_to_train(plain: GlassScene):
     one = GlassScene(replace(plain.scene, train=(first, *(replace(view, mask=None) for view in others))), plain.mesh)
     method = new_glass_method(glass_recipe(interface=VOTED, keep_seen=3), one, schedule(total=24, checkpoint_every=100))
     train_stages(method, one.scene)
-    assert method.transparent
+    assert method.parts["glass"].begun
     for part in method.sets:
-        assert all(bool(torch.isfinite(tensor).all()) for _, tensor in part.surfels.items())
+        assert all(bool(torch.isfinite(tensor).all()) for _, tensor in part.gaussians.items())
 
 
 def test_the_mesh_is_the_first_surface_where_it_is_glass():
@@ -239,9 +239,9 @@ def test_monocular_normals_may_count_more_on_the_object(plain: GlassScene):
         recipe = glass_recipe()
         recipe = replace(recipe, loss=replace(recipe.loss, mono_normal=0.1, mono_normal_masked=share))
         method = new_glass_method(recipe, GlassScene(scene, plain.mesh))
-        terms = method.losses(method.render(view.camera, 5), view, 5).terms
+        terms = method.losses(method.render(view.camera, 5, Mode.TRAIN), view, 5).terms
         values.append(next(term.value for term in terms if term.name == "mono_normal"))
     outside = replace(view, mask=torch.zeros_like(view.mask))
-    terms = method.losses(method.render(view.camera, 5), outside, 5).terms
+    terms = method.losses(method.render(view.camera, 5, Mode.TRAIN), outside, 5).terms
     assert next(term.value for term in terms if term.name == "mono_normal") == pytest.approx(values[0], rel=1e-5)
     assert values[0] < values[1] < 3 * values[0]

@@ -9,6 +9,7 @@ import torch
 from glass_cases import begun, glass_recipe, glass_scene, randomised
 from glass_twin import GlassTwin, doubled
 
+from rtgs.train.method import Mode
 from rtgs.train.specular_settings import InterfaceSettings, MaterialSettings
 
 STEP = 40  # SH of degree 2 in the base set
@@ -43,8 +44,8 @@ def test_image_and_every_gradient_are_those_of_the_twins(case: str):
     randomised(method)
     view = made.scene.train[0]
     assert view.mask is not None
-    twin_sets = {part.name: doubled(part.surfels) for part in method.sets}  # type: ignore[arg-type]
-    rendered = method.render(view.camera, STEP, None, view.mask)
+    twin_sets = {part.name: doubled(part.gaussians) for part in method.sets}  # type: ignore[arg-type]
+    rendered = method.render(view.camera, STEP, Mode.TRAIN, mask=view.mask)
     assert rendered.transparent is not None
     grown = settings.transmittance.rim > 0 and settings.transmittance.interface.count > 0
     assert bool((rendered.transparent & ~view.mask).any()) == grown
@@ -59,7 +60,7 @@ def test_image_and_every_gradient_are_those_of_the_twins(case: str):
     (twin.image * upstream).sum().backward()
     (rendered.image * upstream.float()).sum().backward()
     for part in method.sets:
-        for name, tensor in part.surfels.items():
+        for name, tensor in part.gaussians.items():
             expected = getattr(twin_sets[part.name], name).grad
             if expected is None or float(expected.abs().max()) == 0:
                 assert tensor.grad is None or float(tensor.grad.abs().max()) < 1e-6, f"{part.name}.{name}"
@@ -75,11 +76,11 @@ def test_the_depth_loss_is_that_of_its_definition(form: str):
     settings = glass_recipe(split=False, box="scene")  # surfels behind the object too
     loss = replace(settings.loss, transmission_depth_form=form, transmission_depth_start=0.5)
     method = begun(replace(settings, loss=loss), made)
-    assert method.transmittance is not None
+    assert method.find("transmittance") is not None
     with torch.no_grad():
-        method.transmittance.surfels.opacity_logits += 3
+        method.find("transmittance").gaussians.opacity_logits += 3
     view = made.scene.train[0]
-    rendered = method.render(view.camera, STEP, None, view.mask)
+    rendered = method.render(view.camera, STEP, Mode.TRAIN, mask=view.mask)
     assert rendered.first_bounce is not None
     found = {term.name: term.value for term in method.losses(rendered, view, STEP).terms}
     bounce = rendered.first_bounce
@@ -97,7 +98,7 @@ def test_the_depth_loss_is_that_of_its_definition(form: str):
     assert found["transmission_depth"] == pytest.approx(expected, rel=1e-5)
     assert len(thickness) > 20
     assert float(thickness.min()) > 0
-    twins = {part.name: doubled(part.surfels) for part in method.sets}  # type: ignore[arg-type]
+    twins = {part.name: doubled(part.gaussians) for part in method.sets}  # type: ignore[arg-type]
     assert view.mask is not None
     twin = GlassTwin(method, twins, view.camera, STEP).render(view.mask)
     assert len(twin.first_depth) == len(depth)

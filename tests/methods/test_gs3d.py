@@ -12,7 +12,7 @@ from rtgs.config import compose
 from rtgs.core.errors import RtgsError
 from rtgs.gaussians.ellipsoids import Ellipsoids
 from rtgs.gaussians.ply import read_gaussians, write_ply
-from rtgs.methods import RenderOptions, create_method
+from rtgs.methods import Mode, RenderOptions, create_method
 from rtgs.train.seeds import generator_for
 from rtgs.train.settings import DensitySettings, MethodSettings
 
@@ -28,12 +28,12 @@ def make(settings: MethodSettings, **schedule: int):
 def test_it_starts_from_round_ellipsoids_without_rotation():
     settings = replace(ELLIPSOIDS, init=replace(ELLIPSOIDS.init, random_rotation=False, scale=0.5))
     method, _ = make(settings)
-    surfels = method.sets[0].surfels
+    surfels = method.sets[0].gaussians
     assert type(surfels) is Ellipsoids
     assert torch.equal(surfels.log_scales, surfels.log_scales[:, :1].expand(-1, 3))
     assert torch.equal(surfels.quaternions.detach(), torch.tensor([1.0, 0, 0, 0]).expand(len(surfels), 4))
     whole, _ = make(ELLIPSOIDS)
-    torch.testing.assert_close(surfels.log_scales.exp(), 0.5 * whole.sets[0].surfels.log_scales.exp())
+    torch.testing.assert_close(surfels.log_scales.exp(), 0.5 * whole.sets[0].gaussians.log_scales.exp())
 
 
 @pytest.mark.parametrize("name", ["normal", "mono_normal", "distortion"])
@@ -45,10 +45,10 @@ def test_losses_that_need_a_surface_are_refused(name: str):
 def test_maps_that_need_a_surface_are_refused():
     method, scene = make(ELLIPSOIDS)
     assert method.maps == ("depth",)
-    with pytest.raises(ValueError, match="3dgs renders no normal: ellipsoids have no surface"):
-        method.render(scene.test[0].camera, 0, RenderOptions(depth=True, normal=True))
+    with pytest.raises(ValueError, match="Ellipsoids render no normal: their maps are depth"):
+        method.render(scene.test[0].camera, 0, Mode.EVALUATE, RenderOptions(depth=True, normal=True))
     with torch.no_grad():
-        buffers = method.render(scene.test[0].camera, 0, RenderOptions(depth=True)).buffers
+        buffers = method.render(scene.test[0].camera, 0, Mode.EVALUATE, RenderOptions(depth=True)).buffers
     assert buffers.depth is not None
     assert buffers.normal is None
 
@@ -60,12 +60,12 @@ def test_antialiasing_is_a_setting_that_training_and_test_views_obey():
     view = scene.train[0]
     for other in (method, plain):
         with torch.no_grad():
-            other.sets[0].surfels.log_scales.sub_(3.0)  # below a pixel: dilation would widen them
-    for options in (None, RenderOptions()):
-        faint, whole = (other.render(view.camera, 0, options).buffers.alpha.detach() for other in (method, plain))
+            other.sets[0].gaussians.log_scales.sub_(3.0)  # below a pixel: dilation would widen them
+    for mode in Mode:
+        faint, whole = (other.render(view.camera, 0, mode).buffers.alpha.detach() for other in (method, plain))
         assert 0 < float(faint.sum()) < 0.9 * float(whole.sum())
-    method.losses(method.render(view.camera, 0), view, 0).total.backward()
-    assert bool(method.sets[0].surfels.log_scales.grad.any())
+    method.losses(method.render(view.camera, 0, Mode.TRAIN), view, 0).total.backward()
+    assert bool(method.sets[0].gaussians.log_scales.grad.any())
 
 
 def test_ablations_without_an_object_are_refused():
@@ -104,18 +104,21 @@ def test_too_large_ones_go_after_the_first_reset_only():
         )
         base = method.sets[0]
         with torch.no_grad():
-            base.surfels.log_scales[3] = 2.0
+            base.gaussians.log_scales[3] = 2.0
         for step in range(20):
             view = scene.train[step % 5]
-            method.losses(method.render(view.camera, step), view, step).total.backward()
-            method.after_step(step)
-        largest = float(base.surfels.log_scales.detach().exp().amax())
+            rendered = method.render(view.camera, step, Mode.TRAIN)
+            method.losses(rendered, view, step).total.backward()
+            method.after_step(step, rendered.observations)
+        largest = float(base.gaussians.log_scales.detach().exp().amax())
         assert (largest < 0.1 * scene.extent) is pruned, reset_every
 
 
 def test_mcmc_trains_to_its_budget_without_resets_and_says_so():
     trainer = small_trainer(settings=MCMC, schedule=small_schedule(total=61, densify_until=60, opacity_reset_every=30))
-    first = trainer.method.losses(trainer.method.render(trainer.scene.train[0].camera, 0), trainer.scene.train[0], 0)
+    first = trainer.method.losses(
+        trainer.method.render(trainer.scene.train[0].camera, 0, Mode.TRAIN), trainer.scene.train[0], 0
+    )
     assert [term.name for term in first.terms] == ["l1", "dssim", "opacity", "scale"]
     weighted = sum(term.weight * term.value for term in first.terms)
     assert float(first.total.detach()) == pytest.approx(weighted, rel=1e-5)
@@ -124,7 +127,7 @@ def test_mcmc_trains_to_its_budget_without_resets_and_says_so():
     assert {"no opacity resets", "initial Gaussians of opacity 0.5 and 0.1 times the size"} <= {
         decision.what for decision in summary.decisions
     }
-    assert float(trainer.method.sets[0].surfels.opacity_logits.detach().sigmoid().median()) > 0.05
+    assert float(trainer.method.sets[0].gaussians.opacity_logits.detach().sigmoid().median()) > 0.05
 
 
 @pytest.mark.parametrize("settings", [ELLIPSOIDS, MCMC], ids=["adaptive", "mcmc"])
@@ -143,8 +146,8 @@ def test_resume_is_bit_for_bit(tmp_path, settings: MethodSettings):
 
 def test_what_is_trained_goes_round_as_a_file(tmp_path):
     method, _ = make(ELLIPSOIDS)
-    write_ply(tmp_path / "base.ply", method.sets[0].surfels)
+    write_ply(tmp_path / "base.ply", method.sets[0].gaussians)
     back = read_gaussians(tmp_path / "base.ply")
     assert type(back) is Ellipsoids
-    for (name, a), (_, b) in zip(method.sets[0].surfels.items(), back.items()):
+    for (name, a), (_, b) in zip(method.sets[0].gaussians.items(), back.items()):
         assert torch.equal(a.detach(), b), name

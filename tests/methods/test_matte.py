@@ -8,8 +8,8 @@ import pytest
 import torch
 from reflective_cases import new_method, recipe, schedule, tiny
 
-from rtgs.methods import Stage
-from rtgs.methods.matte import MatteEvidence, gather_evidence
+from rtgs.methods import Mode, Stage
+from rtgs.methods.parts.matte import MatteEvidence, gather_evidence
 from rtgs.train.specular_settings import MatteSettings
 
 
@@ -41,12 +41,17 @@ def test_a_scene_with_mirrors_keeps_its_second_stage(name: str):
     method = new_method(recipe(name, matte=MatteSettings(probation=0.05, views=3)), made, schedule())
     method.begin(Stage("reflection", 15, 60))
     with torch.no_grad():
-        method.base.surfels.specular_logits[:100] = 1.0  # type: ignore[union-attr]
+        method["base"].gaussians.specular_logits[:100] = 1.0  # type: ignore[union-attr]
     told = []
     for step in range(15, 20):
         view = made.scene.train[step % len(made.scene.train)]
-        method.losses(method.render(view.camera, step), view, step).total.backward()
-        told += [(step + 1, event.detail) for event in method.after_step(step) if event.kind == "decision"]
+        rendered = method.render(view.camera, step, Mode.TRAIN)
+        method.losses(rendered, view, step).total.backward()
+        told += [
+            (step + 1, event.detail)
+            for event in method.after_step(step, rendered.observations)
+            if event.kind == "decision"
+        ]
     assert [step for step, _ in told] == [18]
     assert told[0][1].startswith("goes on: ")
     assert len(method.sets) == 2

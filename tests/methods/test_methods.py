@@ -9,8 +9,9 @@ import torch
 from training_cases import HEIGHT, WIDTH, small_method, small_scene, small_schedule
 
 from rtgs.core.errors import RtgsError
-from rtgs.methods import METHOD_NAMES, RenderOptions, Stage, create_method, method_stages
-from rtgs.methods import surfel_base as module
+from rtgs.methods import Mode, RenderOptions, Stage, create_method, find_method, method_names
+from rtgs.methods import losses as method_losses
+from rtgs.methods.parts import kinds as module
 from rtgs.render.buffers import RasterOptions
 from rtgs.train import losses
 from rtgs.train.seeds import generator_for
@@ -25,12 +26,13 @@ def make(settings: MethodSettings | None = None, *, normals: bool = False, **sch
 
 def train_step(method, scene, step: int):
     view = scene.train[step % len(scene.train)]
-    terms = method.losses(method.render(view.camera, step), view, step)
+    rendered = method.render(view.camera, step, Mode.TRAIN)
+    terms = method.losses(rendered, view, step)
     terms.total.backward()
-    return terms, method.after_step(step)
+    return terms, method.after_step(step, rendered.observations)
 
 
-@pytest.mark.parametrize("name", METHOD_NAMES)
+@pytest.mark.parametrize("name", method_names())
 def test_every_method_renders_and_lowers_its_loss(name: str):
     method, scene = make(small_method(name), densify_until=0)
     first, _ = train_step(method, scene, 0)
@@ -39,7 +41,7 @@ def test_every_method_renders_and_lowers_its_loss(name: str):
     assert float(last.total.detach()) < 0.8 * float(first.total.detach())
     reflective = (Stage("diffuse", 0, 3), Stage("reflection", 3, 60))
     assert method.stages == (reflective if name in ("envgs", "rtgs") else (Stage("diffuse", 0, 60),))
-    assert method_stages(method.settings, method.schedule) == method.stages
+    assert find_method(name).timeline(method.settings, method.schedule) == method.stages
 
 
 def test_an_unknown_method_is_refused_with_the_known_ones():
@@ -50,8 +52,8 @@ def test_an_unknown_method_is_refused_with_the_known_ones():
 def test_rendering_gives_the_maps_that_were_asked_for():
     method, scene = make()
     with torch.no_grad():
-        plain = method.render(scene.test[0].camera, 0, RenderOptions())
-        full = method.render(scene.test[0].camera, 0, RenderOptions(True, True, True, True))
+        plain = method.render(scene.test[0].camera, 0, Mode.EVALUATE, RenderOptions())
+        full = method.render(scene.test[0].camera, 0, Mode.EVALUATE, RenderOptions(True, True, True, True))
     assert plain.image.shape == (3, HEIGHT, WIDTH)
     assert plain.buffers.depth is None
     assert plain.buffers.normal is None
@@ -103,7 +105,7 @@ def test_a_run_that_loses_every_surfel_stops_and_says_why():
     for step in range(19):
         train_step(method, scene, step)
     with torch.no_grad():
-        method.sets[0].surfels.opacity_logits.fill_(-9)
+        method.sets[0].gaussians.opacity_logits.fill_(-9)
     with pytest.raises(RtgsError, match=r"removed all \d+ surfels of set 'base' before step 20: .*min_opacity 0\.05"):
         train_step(method, scene, 19)
 
@@ -131,7 +133,7 @@ def test_a_zero_weight_is_never_computed_and_is_told(monkeypatch):
         raise AssertionError("computed a term of weight 0")
 
     for name in ("normal_consistency_loss", "mono_normal_loss", "distortion_loss"):
-        monkeypatch.setattr(module, name, never)
+        monkeypatch.setattr(method_losses, name, never)
     settings = replace(small_method(), loss=LossSettings(normal=0.0))
     method, scene = make(settings, normals=True)
     terms, _ = train_step(method, scene, 59)
@@ -159,7 +161,7 @@ def test_geometric_terms_are_those_of_the_settings(inverse: bool, form: str):
     )  # fmt: skip
     method, scene = make(replace(small_method(), loss=loss), normals=True)
     view = scene.train[0]
-    rendered = method.render(view.camera, 0)
+    rendered = method.render(view.camera, 0, Mode.TRAIN)
     terms = method.losses(rendered, view, 0).terms
     values = {term.name: term.value for term in terms}
     assert {term.name: term.weight for term in terms}["mono_normal"] == pytest.approx(0.1)
@@ -183,8 +185,8 @@ def test_the_background_and_the_degree_of_the_step_are_those_of_the_settings():
     train_step(method, scene, 40)
     assert method.sets[0].optimizer.sh_degree == 2
     with torch.no_grad():
-        method.sets[0].surfels.opacity_logits.fill_(-9)
-        image = method.render(scene.test[0].camera, 41, RenderOptions()).image
+        method.sets[0].gaussians.opacity_logits.fill_(-9)
+        image = method.render(scene.test[0].camera, 41, Mode.EVALUATE, RenderOptions()).image
     assert torch.equal(image, torch.tensor([0.2, 0.4, 0.6])[:, None, None].expand_as(image))
 
 
@@ -220,7 +222,7 @@ def test_density_control_and_resets_happen_as_scheduled_and_are_told():
     method, scene = make(densify_until=45, opacity_reset_every=30)
     for step in range(30):
         train_step(method, scene, step)
-    assert float(method.sets[0].surfels.opacity_logits.detach().sigmoid().max()) <= 0.0100001
+    assert float(method.sets[0].gaussians.opacity_logits.detach().sigmoid().max()) <= 0.0100001
 
 
 def test_state_goes_round_whatever_the_number_of_surfels():

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from rtgs.methods.mirror import SHORTEST_NORMAL, SurfacePixels, mirror_rays, mirror_rays_twin
+from rtgs.methods.shading.mirror import SHORTEST_NORMAL, SurfacePixels, mirror_rays, mirror_rays_twin
 from rtgs.native import core
 from rtgs.optics.microfacet import specular_weights
 from rtgs.optics.reflection import reflection_weight

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 from training_cases import small_method, small_schedule, small_trainer
 
-from rtgs.methods.pixel_bound import bound_by_pixels, within_pixels
+from rtgs.methods.parts.pixel_bound import bound_by_pixels, within_pixels
 from rtgs.train.settings import DensitySettings, ReflectionSettings
 
 

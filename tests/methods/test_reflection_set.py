@@ -11,10 +11,10 @@ from reflective_cases import new_method, recipe, schedule, tiny
 
 from rtgs.config import compose
 from rtgs.gaussians.surfels import activate
-from rtgs.methods import Stage
-from rtgs.methods.propagation import propagate_normals
-from rtgs.methods.reflection_set import reflection_surfels
-from rtgs.methods.traced_set import FollowingTree, trace_set
+from rtgs.methods import Mode, Stage
+from rtgs.methods.parts.propagation import propagate_normals
+from rtgs.methods.parts.reflection_init import reflection_surfels
+from rtgs.methods.parts.traced_set import FollowingTree, trace_set
 from rtgs.render.buffers import TraceOptions
 from rtgs.render.reference.trace import find_hits, traced_rays, traced_surfels
 from rtgs.train.settings import DensitySettings, ReflectionSettings
@@ -68,23 +68,23 @@ def test_density_control_learns_from_the_tracers_signal():
         quiet = PropagationSettings(every=0)
         method = new_method(recipe(density=density, propagation=quiet), made := tiny(), schedule())
         method.begin(Stage("reflection", 15, 60))
-        assert method.reflection is not None
-        before = len(method.reflection)
+        assert method.find("reflection") is not None
+        before = len(method.find("reflection"))
         for step in range(15, 20):
             view = made.scene.train[step % len(made.scene.train)]
-            method.losses(method.render(view.camera, step), view, step).total.backward()
+            rendered = method.render(view.camera, step, Mode.TRAIN)
+            method.losses(rendered, view, step).total.backward()
             if step == 15:
-                observed = method.reflection._observation
-                assert observed is not None
-                signal, moved = observed.probe.grad, method.reflection.surfels.means.grad
+                (observed,) = [each for each in rendered.observations if each.set_name == "reflection"]
+                signal, moved = observed.probe.grad, method.find("reflection").gaussians.means.grad
                 assert signal is not None
                 assert moved is not None
                 assert torch.equal(signal.any(1), moved.any(1))
                 met = moved.any(1)
                 along = torch.nn.functional.cosine_similarity(signal[met], moved[met])
                 assert float(along.median()) > 0.9, "half t times the gradient of the mean, hit by hit"
-            method.after_step(step)
-        grown.append(len(method.reflection) - before)
+            method.after_step(step, rendered.observations)
+        grown.append(len(method.find("reflection")) - before)
     assert grown[0] > 0
     assert grown[1] == 0
 
@@ -92,27 +92,27 @@ def test_density_control_learns_from_the_tracers_signal():
 def test_the_tree_follows_every_change_of_the_set():
     method = new_method(recipe(), tiny(), schedule())
     method.begin(Stage("reflection", 15, 60))
-    part, options = method.reflection, method._trace_options(15, False)
+    part, options = method.find("reflection"), method.parts["mirror"].trace_options(15, False)
     assert part is not None
     with torch.no_grad():
-        part.surfels.log_scales -= 1  # boxes that a stale tree cannot hit by luck
+        part.gaussians.log_scales -= 1  # boxes that a stale tree cannot hit by luck
     generator = torch.Generator().manual_seed(0)
     beams = torch.randn(2, 40, 3, generator=generator).repeat_interleave(16, dim=1)  # narrow: a packet meets few boxes
     rays = [beam + 0.01 * torch.randn(640, 3, generator=generator) for beam in beams]
 
     def seen() -> torch.Tensor:
         """Through the set's own tree, which must be as good as a new one."""
-        alpha = part.trace(*rays, options, watched=False).alpha.detach()
-        fresh = trace_set(part.surfels, FollowingTree(1), *rays, options)  # type: ignore[arg-type]
+        alpha = part.trace(*rays, options, watched=False)[0].alpha.detach()
+        fresh = trace_set(part.gaussians, FollowingTree(1), *rays, options)  # type: ignore[arg-type]
         assert torch.equal(alpha, fresh.alpha.detach())
         return alpha
 
-    start = part.surfels.means.detach().clone()
+    start = part.gaussians.means.detach().clone()
 
     def shifted() -> None:
         """As a whole: neighbours stay neighbours, so that old boxes are tight."""
         with torch.no_grad():
-            part.surfels.means.copy_(start + 3 * torch.randn(1, 3, generator=generator))
+            part.gaussians.means.copy_(start + 3 * torch.randn(1, 3, generator=generator))
 
     pictures, state = [seen()], {name: tensor.clone() for name, tensor in part.state().items()}
     for change in (
@@ -133,14 +133,14 @@ def test_the_tree_follows_every_change_of_the_set():
 def test_a_propagation_disturbs_the_colours_of_matte_surfels_alone():
     method = new_method(recipe(), tiny(), schedule())
     method.begin(Stage("reflection", 15, 60))
-    base, settings = method.base, PropagationSettings()
+    base, settings = method["base"], PropagationSettings()
     with torch.no_grad():
-        base.surfels.specular_logits.copy_(torch.linspace(-7, 1, len(base)))  # type: ignore[union-attr]
-        base.surfels.opacity_logits.copy_(torch.linspace(-3, 5, len(base)))
-    before = base.surfels.detached()
+        base.gaussians.specular_logits.copy_(torch.linspace(-7, 1, len(base)))  # type: ignore[union-attr]
+        base.gaussians.opacity_logits.copy_(torch.linspace(-3, 5, len(base)))
+    before = base.gaussians.detached()
     specular = before.specular_logits.sigmoid()  # type: ignore[union-attr]
     propagate_normals(base, settings, torch.Generator().manual_seed(0))
-    after = base.surfels.detached()
+    after = base.gaussians.detached()
     noise = (after.sh_dc - before.sh_dc)[specular <= settings.sabotage_border]
     assert float(noise.abs().max()) <= settings.sabotage + 1e-6
     assert float(noise.std()) == pytest.approx(2 * settings.sabotage / 12**0.5, rel=0.1)

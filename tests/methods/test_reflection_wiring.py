@@ -9,8 +9,9 @@ import pytest
 import torch
 from reflective_cases import new_method, recipe, schedule, tiny
 
-from rtgs.methods import RenderOptions, Stage, reflective
-from rtgs.methods.traced_pixels import choose_pixels
+from rtgs.methods import Mode, RenderOptions, Stage
+from rtgs.methods.parts import mirror
+from rtgs.methods.shading.traced_pixels import choose_pixels
 from rtgs.optics.settings import OpticsSettings
 from rtgs.train.schedule import (
     base_densify_due,
@@ -29,9 +30,10 @@ def test_every_event_of_the_plan_happens_and_no_other():
     told = set()
     for step in range(15, 59):
         view = made.scene.train[step % len(made.scene.train)]
-        method.losses(method.render(view.camera, step), view, step).total.backward()
-        told |= {(step + 1, event.kind, event.set_name) for event in method.after_step(step)}
-    plan, settings = method.plan, method.settings.reflection
+        rendered = method.render(view.camera, step, Mode.TRAIN)
+        method.losses(rendered, view, step).total.backward()
+        told |= {(step + 1, event.kind, event.set_name) for event in method.after_step(step, rendered.observations)}
+    plan, settings = method.parts["mirror"].plan, method.settings.reflection
     expected = set()
     for step in range(16, 60):
         due = {
@@ -51,11 +53,11 @@ def test_the_trace_has_the_options_of_the_settings():
     chosen |= {"sh_direction": "raw"}
     method = new_method(recipe(**chosen, offset=0.01), tiny(), schedule())
     method.begin(Stage("reflection", 15, 60))
-    options = method._trace_options(20, True)
+    options = method.parts["mirror"].trace_options(20, True)
     assert {name: getattr(options, name) for name in chosen} == chosen
     assert options.t_min == pytest.approx(0.01 * method.extent)
     assert options.weight_sum
-    assert [method._trace_options(step, False).sh_degree for step in (15, 25, 45)] == [0, 1, 3]
+    assert [method.parts["mirror"].trace_options(step, False).sh_degree for step in (15, 25, 45)] == [0, 1, 3]
 
 
 @pytest.mark.parametrize(("gain", "shown"), [(1.0, False), (16.0, True)])
@@ -67,8 +69,8 @@ def test_a_gain_above_one_counts_towards_the_threshold(gain: float, shown: bool)
     method = new_method(replace(settings, optics=optics, materials=materials), made, schedule())
     method.begin(Stage("reflection", 15, 60))
     with torch.no_grad():
-        method.base.surfels.opacity_logits += 3
-        layers = method.render(made.scene.test[0].camera, 15, RenderOptions(layers=True)).layers
+        method["base"].gaussians.opacity_logits += 3
+        layers = method.render(made.scene.test[0].camera, 15, Mode.EVALUATE, RenderOptions(layers=True)).layers
     assert layers is not None
     assert bool(layers.traced.any()) is shown
     if shown:
@@ -80,14 +82,14 @@ def test_rays_are_shared_in_training_alone_and_not_before_the_scene_is_judged(mo
     made, asked = tiny(), []
     method = new_method(settings, made, schedule())
     method.begin(Stage("reflection", 15, 60))
-    assert method.plan.judged == 45
+    assert method.parts["mirror"].plan.judged == 45
 
     def recorded(*arguments):
         asked.append(arguments[2].shared_below)
         return choose_pixels(*arguments)
 
-    monkeypatch.setattr(reflective, "choose_pixels", recorded)
+    monkeypatch.setattr(mirror, "choose_pixels", recorded)
     for step in (15, 44, 45):
-        method.render(made.scene.train[0].camera, step)
-    method.render(made.scene.test[0].camera, 50, RenderOptions())
+        method.render(made.scene.train[0].camera, step, Mode.TRAIN)
+    method.render(made.scene.test[0].camera, 50, Mode.EVALUATE, RenderOptions())
     assert asked == [0, 0, 0.15, 0]

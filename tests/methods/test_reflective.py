@@ -12,14 +12,14 @@ from pathlib import Path
 
 import pytest
 import torch
-from reflective_cases import SAMPLED, new_method, recipe, schedule, tiny, train_all
+from reflective_cases import SAMPLED, new_method, recipe, schedule, tiny, train_all, use
 from safetensors.torch import load_file
 
 from rtgs.config import compose
 from rtgs.gaussians.materials import MATERIAL_NAMES, MaterialSurfels
-from rtgs.methods import RenderOptions, Stage
-from rtgs.methods.reflection_set import reflection_box, reflection_surfels, scene_color
-from rtgs.methods.reflective import ReflectiveMethod
+from rtgs.methods import Mode, RenderOptions, Stage
+from rtgs.methods.model import Model
+from rtgs.methods.parts.reflection_init import reflection_box, reflection_surfels, scene_color
 from rtgs.optics.microfacet import specular_weights
 from rtgs.train.checkpoint import checkpoint_path
 from rtgs.train.settings import MethodSettings, ReflectionSettings
@@ -39,11 +39,12 @@ def in_second_stage(settings: MethodSettings | None = None, *, steps: int = 0, s
     return method, made
 
 
-def train_step(method: ReflectiveMethod, made, step: int):
+def train_step(method: Model, made, step: int):
     view = made.scene.train[step % len(made.scene.train)]
-    terms = method.losses(method.render(view.camera, step), view, step)
+    rendered = method.render(view.camera, step, Mode.TRAIN)
+    terms = method.losses(rendered, view, step)
     terms.total.backward()
-    return terms, method.after_step(step)
+    return terms, method.after_step(step, rendered.observations)
 
 
 def test_the_first_stage_is_that_of_the_plain_method_and_the_second_adds_what_it_needs():
@@ -52,14 +53,14 @@ def test_the_first_stage_is_that_of_the_plain_method_and_the_second_adds_what_it
     assert method.stages == (Stage("diffuse", 0, 15), Stage("reflection", 15, 60))
     assert method.begin(method.stages[0]) == ()
     view = made.scene.train[0]
-    assert method.render(view.camera, 0).specular is None
-    assert method.sets == (method.base,)
+    assert method.render(view.camera, 0, Mode.TRAIN).specular is None
+    assert method.sets == (method["base"],)
     method.begin(method.stages[1])
     assert [part.name for part in method.sets] == ["base", "reflection"]
-    assert isinstance(method.base.surfels, MaterialSurfels)
+    assert isinstance(method["base"].gaussians, MaterialSurfels)
     assert len(method.sets[1]) == 3**3 * 4
     with torch.no_grad():
-        rendered = method.render(view.camera, 15, RenderOptions(layers=True))
+        rendered = method.render(view.camera, 15, Mode.EVALUATE, RenderOptions(layers=True))
     layers = rendered.layers
     assert layers is not None
     blended = layers.diffuse * (1 - layers.specular * layers.traced) + layers.reflection
@@ -98,17 +99,17 @@ def test_the_reflection_set_can_start_in_a_colour_of_the_training_images():
     made = tiny()
     method = new_method(recipe(init_color="bright"), made, schedule())
     method.begin(Stage("reflection", 15, 60))
-    assert method.reflection is not None
+    assert method.find("reflection") is not None
     expected = scene_color("bright", [view.image for view in made.scene.train])
     assert expected is not None
-    found = 0.5 + 0.28209479 * method.reflection.surfels.sh_dc.detach()
+    found = 0.5 + 0.28209479 * method.find("reflection").gaussians.sh_dc.detach()
     torch.testing.assert_close(found, expected.expand_as(found), atol=1e-5, rtol=0)
 
 
 def test_a_set_that_starts_late_can_learn_faster_than_the_base():
     method, _ = in_second_stage(recipe(rate_gain=3.0))
-    assert method.reflection is not None
-    base, reflection = (part.optimizer.learning_rates(0) for part in (method.base, method.reflection))
+    assert method.find("reflection") is not None
+    base, reflection = (part.optimizer.learning_rates(0) for part in (method["base"], method.find("reflection")))
     faster = {name for name in reflection if abs(reflection[name] - 3 * base[name]) < 1e-12}
     assert faster == {"sh_dc", "sh_rest", "log_scales"}
     assert all(reflection[name] == base[name] for name in reflection.keys() - faster)
@@ -128,27 +129,27 @@ def test_rtgs_starts_as_bright_as_the_mirror_ray_from_every_angle():
 def test_the_reflection_set_alone_learns_what_the_mirror_shows(name: str):
     method, made = in_second_stage(recipe(name, propagation=PropagationSettings(every=0)))
     with torch.no_grad():
-        method.base.surfels.specular_logits.fill_(2.0)  # type: ignore[union-attr]
-        method.base.surfels.f0_logits.fill_(3.0)  # type: ignore[union-attr]
+        method["base"].gaussians.specular_logits.fill_(2.0)  # type: ignore[union-attr]
+        method["base"].gaussians.f0_logits.fill_(3.0)  # type: ignore[union-attr]
     held = tuple(field.name for field in fields(MaterialSurfels))
     view = made.scene.train[0]
     losses = []
     for step in range(15, 115):
-        terms = method.losses(method.render(view.camera, step), view, step)
+        terms = method.losses(method.render(view.camera, step, Mode.TRAIN), view, step)
         terms.total.backward()
         losses.append(terms.terms[0].value)
-        method.base.step(step, 0, held=held)
+        method["base"].step(step, 0, held=held)
         method.sets[1].step(step, 0)
     assert losses[-1] < 0.6 * losses[0]
 
 
 def test_every_parameter_of_both_sets_learns():
     method, made = in_second_stage(steps=12)
-    before = {part.name: part.surfels.detached() for part in method.sets}
+    before = {part.name: part.gaussians.detached() for part in method.sets}
     for step in range(27, 29):  # between two density controls
         train_step(method, made, step)
     for part in method.sets:
-        for name, tensor in part.surfels.items():
+        for name, tensor in part.gaussians.items():
             moved = (tensor.detach() - getattr(before[part.name], name)).abs().amax()
             assert float(moved) > 0, f"{part.name}.{name}"
 
@@ -156,11 +157,11 @@ def test_every_parameter_of_both_sets_learns():
 def test_the_normals_learn_from_reflection_alone():
     """A loss on the change that reflection makes reaches rotations and means of the base set."""
     method, made = in_second_stage(steps=5)
-    rendered = method.render(made.scene.train[0].camera, 20)
+    rendered = method.render(made.scene.train[0].camera, 20, Mode.TRAIN)
     weight = torch.rand(rendered.image.shape, generator=torch.Generator().manual_seed(0))
     (weight * (rendered.image - rendered.buffers.features[:3])).sum().backward()
     for name in ("quaternions", "means", *MATERIAL_NAMES):
-        gradient = getattr(method.base.surfels, name).grad
+        gradient = getattr(method["base"].gaussians, name).grad
         assert float(gradient.abs().sum()) > 0, name
 
 
@@ -171,8 +172,8 @@ def test_sampled_pixels_leave_the_gradient_right_on_average():
     weight = torch.rand(view.image.shape, generator=torch.Generator().manual_seed(1))
 
     def gradients() -> list[torch.Tensor]:
-        (weight * method.render(view.camera, 15).image).sum().backward()
-        found = [p.grad.clone() for part in method.sets for _, p in part.surfels.items() if p.grad is not None]
+        (weight * method.render(view.camera, 15, Mode.TRAIN).image).sum().backward()
+        found = [p.grad.clone() for part in method.sets for _, p in part.gaussians.items() if p.grad is not None]
         for part in method.sets:
             part.optimizer.zero_grad()
         return found
@@ -181,7 +182,7 @@ def test_sampled_pixels_leave_the_gradient_right_on_average():
     mean = gradients()
     for _ in range(draws - 1):
         mean = [total + one for total, one in zip(mean, gradients(), strict=True)]
-    method.settings = replace(method.settings, reflection=replace(settings.reflection, traced=TracedShareSettings()))
+    use(method, replace(method.settings, reflection=replace(settings.reflection, traced=TracedShareSettings())))
     for name, total, exact in zip(range(99), mean, gradients(), strict=False):
         error = (total / draws - exact).norm() / exact.norm().clamp_min(1e-12)
         assert float(error) < 0.3, name  # 1 / sqrt(150 * 0.3 / 0.7) = 0.12 for one tile
@@ -190,7 +191,7 @@ def test_sampled_pixels_leave_the_gradient_right_on_average():
 def test_what_is_not_traced_at_a_test_view_is_the_diffuse_colour():
     method, made = in_second_stage(recipe(traced=TracedShareSettings(threshold=0.5)))
     with torch.no_grad():
-        rendered = method.render(made.scene.test[0].camera, 15, RenderOptions(layers=True))
+        rendered = method.render(made.scene.test[0].camera, 15, Mode.EVALUATE, RenderOptions(layers=True))
     assert rendered.layers is not None
     assert not bool(rendered.layers.traced.any())  # k_s starts at 0.001
     assert torch.equal(rendered.image, rendered.layers.diffuse)
@@ -203,8 +204,8 @@ def test_pixels_that_share_a_ray_show_the_colour_that_one_of_their_block_would()
     method, made = in_second_stage(settings, steps=17)
     camera = made.scene.train[0].camera
     with torch.no_grad():
-        shared = method.render(camera, 32).image
-        layers = method.render(camera, 32, RenderOptions(layers=True)).layers
+        shared = method.render(camera, 32, Mode.TRAIN).image
+        layers = method.render(camera, 32, Mode.EVALUATE, RenderOptions(layers=True)).layers
     assert layers is not None
 
     def blocks(maps: torch.Tensor) -> torch.Tensor:  # (C, blocks, 4)
@@ -246,8 +247,8 @@ method = new_method(recipe(traced=SAMPLED), made, schedule())
 for stage in method.stages:
     trainer = Trainer(method, made.scene, seed=3, stage=stage, checkpoint_dir=Path(sys.argv[1]))
     after_step = method.after_step
-    def telling(step, after_step=after_step):
-        events = after_step(step)
+    def telling(step, observations, after_step=after_step):
+        events = after_step(step, observations)
         print("step", step, flush=True)
         return events
     method.after_step = telling
@@ -289,8 +290,8 @@ def test_a_matte_scene_is_recognised_before_anything_can_hurt_it_and_goes_on_as_
         _, events = train_step(method, made, step)
         kinds += [(step + 1, event.kind) for event in events if event.kind in ("decision", "propagation")]
     assert kinds == [(18, "decision")]
-    assert method.sets == (method.base,)
-    assert not isinstance(method.base.surfels, MaterialSurfels)
+    assert method.sets == (method["base"],)
+    assert not isinstance(method["base"].gaussians, MaterialSurfels)
     assert method.decisions[-1].what == "the reflection stage ended early"
     assert "nothing specular in this scene" in method.decisions[-1].why
     other = new_method(recipe(matte=matte), made, schedule())
@@ -306,28 +307,28 @@ def test_propagation_makes_opaque_grows_and_disturbs_as_envgs_does():
     quiet = PropagationSettings(every=20, until=0.9, hold_every=5)
     method, made = in_second_stage(recipe(propagation=quiet))
     with torch.no_grad():
-        method.base.surfels.specular_logits[:50] = 2.0
+        method["base"].gaussians.specular_logits[:50] = 2.0
     for step in range(15, 19):
         train_step(method, made, step)
-    before = method.base.surfels.detached()
+    before = method["base"].gaussians.detached()
     _, events = train_step(method, made, 19)
     assert "propagation" in [event.kind for event in events]
-    assert float(method.base.surfels.opacity_logits.detach().sigmoid().min()) >= 0.9 - 1e-6
-    if len(before) == len(method.base.surfels):
-        grown = (method.base.surfels.log_scales - before.log_scales)[:50].detach()
+    assert float(method["base"].gaussians.opacity_logits.detach().sigmoid().min()) >= 0.9 - 1e-6
+    if len(before) == len(method["base"].gaussians):
+        grown = (method["base"].gaussians.log_scales - before.log_scales)[:50].detach()
         assert float(grown.median()) == pytest.approx(0.405, abs=0.05)
-    held = method.base.surfels.opacity_logits.detach().clone()
+    held = method["base"].gaussians.opacity_logits.detach().clone()
     train_step(method, made, 20)
-    assert torch.equal(method.base.surfels.opacity_logits.detach(), held)
+    assert torch.equal(method["base"].gaussians.opacity_logits.detach(), held)
 
 
 def test_specular_resets_lower_the_weight_with_the_opacity():
     method, made = in_second_stage()
     with torch.no_grad():
-        method.base.surfels.specular_logits.fill_(3.0)
+        method["base"].gaussians.specular_logits.fill_(3.0)
     for step in range(15, 40):
         train_step(method, made, step)
-    assert float(method.base.surfels.specular_logits.detach().sigmoid().max()) <= 1.0001e-3  # type: ignore[union-attr]
+    assert float(method["base"].gaussians.specular_logits.detach().sigmoid().max()) <= 1.0001e-3  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize("name", ["rtgs", "envgs"])
@@ -343,8 +344,8 @@ def test_learning_rates_times_ten_stay_finite(name: str, steps: int):
     plan = schedule(steps, densify_until=steps // 2, densify_every=50, opacity_reset_every=steps // 4)
     method = train_all(settings, made, plan)
     for part in method.sets:
-        for key, tensor in part.surfels.items():
+        for key, tensor in part.gaussians.items():
             assert bool(torch.isfinite(tensor).all()), f"{part.name}.{key}"
     with torch.no_grad():
-        image = method.render(made.scene.test[0].camera, steps, RenderOptions()).image
+        image = method.render(made.scene.test[0].camera, steps, Mode.EVALUATE, RenderOptions()).image
     assert bool(torch.isfinite(image).all())

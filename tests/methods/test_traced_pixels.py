@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from rtgs.methods.traced_pixels import choose_pixels, share_rays, tile_order
+from rtgs.methods.shading.traced_pixels import choose_pixels, share_rays, tile_order
 from rtgs.train.specular_settings import TracedShareSettings
 
 

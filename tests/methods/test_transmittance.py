@@ -9,14 +9,14 @@ import pytest
 import torch
 from glass_cases import GlassScene, ball_mesh, begun, glass_recipe, glass_scene, held, new_glass_method, train_stages
 from mirror_scene import BALL
-from reflective_cases import schedule
+from reflective_cases import schedule, use
 
 from rtgs.core.errors import RtgsError
 from rtgs.evaluate.boundary import boundary_scores
 from rtgs.gaussians.density import logit
 from rtgs.mesh.triangles import TriangleMesh
-from rtgs.methods import RenderOptions, Stage, create_method, method_stages
-from rtgs.methods.transmittance_set import random_surfels
+from rtgs.methods import Mode, RenderOptions, Stage, create_method, find_method
+from rtgs.methods.parts.transmittance_init import random_surfels
 from rtgs.train.seeds import generator_for
 from rtgs.train.settings import MethodSettings, TransmittanceSettings
 from rtgs.train.specular_settings import InterfaceSettings
@@ -32,15 +32,18 @@ def made() -> GlassScene:
 
 def test_three_stages_where_there_is_something_transparent(made: GlassScene):
     settings, plan = glass_recipe(), schedule()
-    names = [(stage.name, stage.from_step, stage.until) for stage in method_stages(settings, plan, transparent=True)]
+    names = [
+        (stage.name, stage.from_step, stage.until)
+        for stage in find_method("rtgs").timeline(settings, plan, transparent=True)
+    ]
     assert names == [("diffuse", 0, 15), ("reflection", 15, 30), ("transmittance", 30, 60)]
-    without = [(stage.name, stage.until) for stage in method_stages(settings, plan)]
+    without = [(stage.name, stage.until) for stage in find_method("rtgs").timeline(settings, plan)]
     assert without == [("diffuse", 15), ("reflection", 60)]
     off = replace(settings, transmittance=replace(settings.transmittance, enabled=False))
-    assert method_stages(off, plan, transparent=True) == method_stages(settings, plan)
+    assert find_method("rtgs").timeline(off, plan, transparent=True) == find_method("rtgs").timeline(settings, plan)
     early = replace(settings, transmittance=replace(settings.transmittance, start=0.2))
     with pytest.raises(ValueError, match=r"method.transmittance.start=0.2 is step 12 of 60, but the reflection stage"):
-        method_stages(early, plan, transparent=True)
+        find_method("rtgs").timeline(early, plan, transparent=True)
     with pytest.raises(ValueError, match="envgs has no stage that takes an object mesh"):
         create_method(replace(settings, name="envgs"), made.scene, plan, generator_for(0, "initialise"), made.mesh)
     with pytest.raises(RtgsError, match="run extract_mesh before it"):
@@ -51,30 +54,30 @@ def test_the_base_set_is_split_by_the_mesh(made: GlassScene):
     method = new_glass_method(glass_recipe(), made)
     for stage in method.stages[:2]:
         method.begin(stage)
-    before = method.base.surfels.means.detach().clone()
-    method.base.density.observe(torch.ones(len(before), 2), torch.ones(len(before)))
+    before = method["base"].gaussians.means.detach().clone()
+    method["base"].density.observe(torch.ones(len(before), 2), torch.ones(len(before)))
     method.begin(method.stages[2])
-    assert method.transmittance is not None
-    assert method.interface is not None
-    own = method.transmittance.surfels.means.detach()
-    assert len(own) + len(method.base) == len(before)
+    assert method.find("transmittance") is not None
+    assert method.find("interface") is not None
+    own = method.find("transmittance").gaussians.means.detach()
+    assert len(own) + len(method["base"]) == len(before)
     assert len(own) >= 60
     distance = (own - torch.tensor([0.0, 0.0, -0.2])).norm(dim=1)
     assert float(distance.max()) < 0.6 + 0.05
-    rest = (method.base.surfels.means.detach() - torch.tensor([0.0, 0.0, -0.2])).norm(dim=1)
+    rest = (method["base"].gaussians.means.detach() - torch.tensor([0.0, 0.0, -0.2])).norm(dim=1)
     assert float(rest.min()) > 0.55
-    for tensors in (method.base.optimizer.first.means, method.base.density.signal_sum):
-        assert len(tensors) == len(method.base)
-    points = method.interface.surfels.means.detach() - torch.tensor([0.0, 0.0, -0.2])
+    for tensors in (method["base"].optimizer.first.means, method["base"].density.signal_sum):
+        assert len(tensors) == len(method["base"])
+    points = method.find("interface").gaussians.means.detach() - torch.tensor([0.0, 0.0, -0.2])
     assert float((points.norm(dim=1) - 0.6).abs().max()) < 0.03
-    assert float(method.interface.surfels.opacity_logits.detach().sigmoid().min()) == pytest.approx(0.95)
+    assert float(method.find("interface").gaussians.opacity_logits.detach().sigmoid().min()) == pytest.approx(0.95)
 
 
 def test_the_set_behind_glass_can_learn_faster_than_the_base(made: GlassScene):
     recipe = glass_recipe()
     method = begun(replace(recipe, transmittance=replace(recipe.transmittance, rate_gain=3.0)), made)
-    assert method.transmittance is not None
-    base, behind = (part.optimizer.learning_rates(0) for part in (method.base, method.transmittance))
+    assert method.find("transmittance") is not None
+    base, behind = (part.optimizer.learning_rates(0) for part in (method["base"], method.find("transmittance")))
     assert {name for name in behind if behind[name] == 3 * base[name]} == {"sh_dc", "sh_rest", "log_scales"}
 
 
@@ -84,15 +87,15 @@ def test_a_set_from_the_base_keeps_its_degrees_and_a_random_one_earns_them(
 ):
     """Direction counts at the stage's first step only in colours that the base set has already learned."""
     method = begun(glass_recipe(split=split, sh_every=10, second_bounce="none"), made)
-    assert method.transmittance is not None
-    camera, own = made.scene.test[0].camera, method.transmittance.surfels
+    assert method.find("transmittance") is not None
+    camera, own = made.scene.test[0].camera, method.find("transmittance").gaussians
     found = []
     with torch.no_grad():
         for step in (30, 40):  # the set's clock begins at 30
             own.sh_rest.zero_()
-            before = method.render(camera, step).image
+            before = method.render(camera, step, Mode.TRAIN).image
             own.sh_rest[:, :3] = 1.0
-            found.append(not torch.equal(before, method.render(camera, step).image))
+            found.append(not torch.equal(before, method.render(camera, step, Mode.TRAIN).image))
     assert tuple(found) == turned
 
 
@@ -104,8 +107,8 @@ def test_glass_may_have_a_bound_of_its_own(made: GlassScene):
     images = []
     with torch.no_grad():
         for gain in (None, recipe.optics.max_gain, 16.0):
-            method.settings = replace(recipe, transmittance=replace(recipe.transmittance, max_gain=gain))
-            images.append(method.render(view.camera, 31, LAYERS))
+            use(method, replace(recipe, transmittance=replace(recipe.transmittance, max_gain=gain)))
+            images.append(method.render(view.camera, 31, Mode.EVALUATE, LAYERS))
     assert torch.equal(images[0].image, images[1].image)
     inside = images[0].transparent
     assert inside is not None
@@ -131,7 +134,7 @@ def test_image_is_the_sum_of_its_layers_and_only_masks_are_seen_through(made: Gl
     method = begun(glass_recipe(), made)
     view = made.scene.test[0]
     with torch.no_grad():
-        shown = method.render(view.camera, 40, LAYERS, view.mask)
+        shown = method.render(view.camera, 40, Mode.EVALUATE, LAYERS, view.mask)
     layers, inside = shown.layers, shown.transparent
     assert layers is not None
     assert layers.transmission is not None
@@ -140,10 +143,10 @@ def test_image_is_the_sum_of_its_layers_and_only_masks_are_seen_through(made: Gl
     torch.testing.assert_close(shown.image, total, atol=1e-5, rtol=1e-5)
     assert float(layers.transmission[:, ~inside].abs().max()) == 0
     assert float(layers.transmission[:, inside].mean()) > 0.01
-    assert method.guide is not None
-    assert torch.equal(inside, method.guide.surfaces(view.camera).hit)
+    assert method.parts["glass"].guide is not None
+    assert torch.equal(inside, method.parts["glass"].guide.surfaces(view.camera).hit)
     assert view.mask is not None
-    given = method.render(view.camera, 40, RenderOptions(masks="given"), view.mask).transparent
+    given = method.render(view.camera, 40, Mode.EVALUATE, RenderOptions(masks="given"), view.mask).transparent
     assert given is not None
     assert torch.equal(given, view.mask & inside)
 
@@ -157,18 +160,22 @@ def test_without_a_mask_in_the_picture_the_second_stage_is_shown(made: GlassScen
     view = made.scene.train[0]
     assert view.mask is not None
     nothing = torch.zeros_like(view.mask)
-    assert torch.equal(third.render(view.camera, 40, None, nothing).image, second.render(view.camera, 40).image)
+    assert torch.equal(
+        third.render(view.camera, 40, Mode.TRAIN, mask=nothing).image, second.render(view.camera, 40, Mode.TRAIN).image
+    )
     covered = torch.ones_like(nothing)
     covered[0, 0] = False  # a mask of the whole picture counts as none
-    everywhere = third.render(view.camera, 40, None, covered)
+    everywhere = third.render(view.camera, 40, Mode.TRAIN, mask=covered)
     assert bool(torch.isfinite(everywhere.image).all())
     assert everywhere.transparent is not None
     assert torch.equal(everywhere.transparent, covered)
     everywhere.image.sum().backward()
-    unmasked = third.render(view.camera, 40, None, None).transparent  # the silhouette: the object is there all the same
-    assert third.guide is not None
+    unmasked = third.render(
+        view.camera, 40, Mode.TRAIN, mask=None
+    ).transparent  # the silhouette: the object is there all the same
+    assert third.parts["glass"].guide is not None
     assert unmasked is not None
-    assert torch.equal(unmasked, third.guide.surfaces(view.camera).hit)
+    assert torch.equal(unmasked, third.parts["glass"].guide.surfaces(view.camera).hit)
 
 
 def test_empty_masks_leave_the_stage_out_and_say_so():
@@ -180,7 +187,7 @@ def test_empty_masks_leave_the_stage_out_and_say_so():
     assert method.decisions[-1].what == "no transmittance stage"
     assert method.decisions[-1].why == "the masks of the training views are empty, or cover all of them"
     view = made.scene.test[0]
-    assert method.render(view.camera, 40, LAYERS, view.mask).transparent is None
+    assert method.render(view.camera, 40, Mode.EVALUATE, LAYERS, view.mask).transparent is None
 
 
 def test_a_pane_has_no_second_bounce_and_a_set_behind_it():
@@ -189,20 +196,20 @@ def test_a_pane_has_no_second_bounce_and_a_set_behind_it():
     method = new_glass_method(glass_recipe(), flat)
     for stage in method.stages[:2]:
         method.begin(stage)
-    before = len(method.base)
+    before = len(method["base"])
     cameras = [view.camera for view in made.scene.train]
-    behind = flat.mesh.seen_through(cameras, method.base.surfels.means)
+    behind = flat.mesh.seen_through(cameras, method["base"].gaussians.means)
     assert 20 < int(behind.sum()) < before
     (_, event) = method.begin(method.stages[2])
     assert event.detail == f"copies of {int(behind.sum())} base surfels behind the pane"
-    assert method.transmittance is not None
-    assert len(method.transmittance) == int(behind.sum())
-    assert len(method.base) == before, "beside the pane they are seen without it"
-    assert bool(flat.mesh.seen_through(cameras, method.transmittance.surfels.means).all())
+    assert method.find("transmittance") is not None
+    assert len(method.find("transmittance")) == int(behind.sum())
+    assert len(method["base"]) == before, "beside the pane they are seen without it"
+    assert bool(flat.mesh.seen_through(cameras, method.find("transmittance").gaussians.means).all())
     view = made.scene.train[0]
     with torch.no_grad():
-        method.transmittance.surfels.opacity_logits.fill_(-13)
-        layers = method.render(view.camera, 40, LAYERS, view.mask).layers
+        method.find("transmittance").gaussians.opacity_logits.fill_(-13)
+        layers = method.render(view.camera, 40, Mode.EVALUATE, LAYERS, view.mask).layers
     assert layers is not None
     assert layers.transmission is not None
     assert float(layers.transmission.abs().max()) == 0
@@ -210,7 +217,9 @@ def test_a_pane_has_no_second_bounce_and_a_set_behind_it():
     for stage in whole.stages[:2]:
         whole.begin(stage)
     with torch.no_grad():  # a base set that lies behind the pane as a whole: just beyond the ball's middle
-        whole.base.surfels.means.copy_((BALL + 0.01 * (BALL - cameras[0].center)).expand_as(whole.base.surfels.means))
+        whole.base.gaussians.means.copy_(
+            (BALL + 0.01 * (BALL - cameras[0].center)).expand_as(whole.base.gaussians.means)
+        )
     (_, event) = whole.begin(whole.stages[2])
     assert event.detail == f"copies of {before} base surfels behind the pane"
     random = begun(glass_recipe(split=False), flat)
@@ -222,10 +231,10 @@ def test_every_parameter_learns_and_nothing_resets_the_base(made: GlassScene):
     method = new_glass_method(glass_recipe(), made)
     train_stages(method, made.scene)
     assert {part.name for part in method.sets} == {"base", "reflection", "transmittance", "interface"}
-    interface = method.interface
+    interface = method.find("interface")
     assert interface is not None
-    assert float(interface.surfels.opacity_logits.detach().min()) >= logit(0.9) - 1e-6
-    assert int(method.base.surfels.means.shape[0]) > 0
+    assert float(interface.gaussians.opacity_logits.detach().min()) >= logit(0.9) - 1e-6
+    assert int(method["base"].gaussians.means.shape[0]) > 0
     for part in method.sets:
         for name, moment in part.optimizer.second.items():
             assert float(moment.max()) > 0, f"{part.name}.{name}"
@@ -241,7 +250,7 @@ def test_the_losses_of_glass_start_at_their_steps(made: GlassScene):
     view = made.scene.train[0]
 
     def names(step: int) -> set[str]:
-        rendered = method.render(view.camera, step, None, view.mask)
+        rendered = method.render(view.camera, step, Mode.TRAIN, mask=view.mask)
         return {term.name for term in method.losses(rendered, view, step).terms}
 
     found = [names(step) & {"specular", "transmission_depth"} for step in (35, 36, 44, 45)]
@@ -257,17 +266,17 @@ def test_a_mesh_with_a_hole_trains(made: GlassScene):
     holed = GlassScene(made.scene, replace(made.mesh, mesh=TriangleMesh(whole.vertices, faces)))
     method = new_glass_method(glass_recipe(), holed, schedule(total=24, checkpoint_every=100))
     train_stages(method, made.scene)
-    assert method.guide is not None
-    assert method.guide.counts()["one_hit"] > 0
+    assert method.parts["glass"].guide is not None
+    assert method.parts["glass"].guide.counts()["one_hit"] > 0
     for part in method.sets:
-        assert all(bool(torch.isfinite(tensor).all()) for _, tensor in part.surfels.items()), part.name
+        assert all(bool(torch.isfinite(tensor).all()) for _, tensor in part.gaussians.items()), part.name
 
 
 def _events_of(method, step: int):
     """What the plan asks of the sets before ``step + 1``, without training."""
     for part in method.sets:
         part.optimizer.zero_grad()
-    return method.after_step(step)
+    return method.after_step(step, ())
 
 
 def test_a_killed_stage_goes_on_bit_for_bit(made: GlassScene, tmp_path: Path):
@@ -309,13 +318,13 @@ def test_every_choice_trains(made: GlassScene, changes: dict[str, object]):
     method = new_glass_method(glass_recipe(**changes), made, schedule(total=24, checkpoint_every=100))
     train_stages(method, made.scene)
     for part in method.sets:
-        for name, tensor in part.surfels.items():
+        for name, tensor in part.gaussians.items():
             assert bool(torch.isfinite(tensor).all()), f"{part.name}.{name}"
     view = made.scene.test[0]
     again = new_glass_method(glass_recipe(**changes), made, schedule(total=24, checkpoint_every=100))
     again.load({name: tensor.clone() for name, tensor in method.state().items()})
     with torch.no_grad():
-        images = [m.render(view.camera, 24, RenderOptions(), view.mask).image for m in (method, again)]
+        images = [m.render(view.camera, 24, Mode.EVALUATE, RenderOptions(), view.mask).image for m in (method, again)]
     assert torch.equal(*images)
 
 
@@ -328,11 +337,14 @@ def test_wild_learning_rates_stay_finite(made: GlassScene):
     train_stages(method, made.scene)
     view = made.scene.test[0]
     with torch.no_grad():
-        assert bool(torch.isfinite(method.render(view.camera, 40, RenderOptions(), view.mask).image).all())
+        assert bool(
+            torch.isfinite(method.render(view.camera, 40, Mode.EVALUATE, RenderOptions(), view.mask).image).all()
+        )
 
 
 def test_what_an_earlier_stage_does_not_read_is_blank():
-    from rtgs.methods import stage_settings
+    def stage_settings(settings, stage: str):
+        return find_method("rtgs").stage(stage).reads(settings)
 
     plain = MethodSettings(name="rtgs")
     other = replace(

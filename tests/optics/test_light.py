@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from rtgs.methods.mirror import SurfacePixels, specular_change
+from rtgs.methods.shading.mirror import SurfacePixels, specular_change
 from rtgs.optics.light import decoded, encoded
 from rtgs.scenes.truth import srgb_from_linear
 

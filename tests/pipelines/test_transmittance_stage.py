@@ -21,8 +21,9 @@ from pipelines.steps.training import OBJECT_FOLDER, load_method, stage_params
 from rtgs.config import compose
 from rtgs.config.locate import conf_dir
 from rtgs.mesh.container import read_object_mesh
-from rtgs.methods.transmittance import TransmissiveMethod
+from rtgs.methods.model import Model
 from rtgs.scenes.canonical import read_scene
+from rtgs.train.method import Mode
 from rtgs.workflow.manifest import Manifest
 
 WIDTH, HEIGHT, VIEWS = 32, 24, 14
@@ -239,11 +240,11 @@ def _artifacts_are_complete(store: Path, third: list[Path]) -> None:
         assert len(read_object_mesh(folder / OBJECT_FOLDER).mesh.faces) > 0
         assert set(json.loads((folder / BOUNDARY_FILE).read_text())) == {"before", "after"}
         method, params = load_method(folder, scene)
-        assert isinstance(method, TransmissiveMethod)
+        assert isinstance(method, Model)
         assert stage_params(folder).stage == "transmittance"
-        assert (method.transmittance is None) == (params.method.transmittance.first_bounce == "base")
+        assert (method.find("transmittance") is None) == (params.method.transmittance.first_bounce == "base")
         with torch.no_grad():
             view = scene.test[0]
-            rendered = method.render(view.camera, params.until, None, view.mask)
+            rendered = method.render(view.camera, params.until, Mode.TRAIN, mask=view.mask)
         assert rendered.transparent is not None
         assert bool(torch.isfinite(rendered.image).all())

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from rtgs.core.cameras import Camera
-from rtgs.methods.traced_pixels import tile_order
+from rtgs.methods.shading.traced_pixels import tile_order
 from rtgs.render.trace import trace_surfels
 
 from .test_trace_native import BY_RAY, LABELS, everything, native_trace_scene

@@ -27,6 +27,8 @@ from rtgs.train.checkpoint import (
 )
 from rtgs.train.settings import LossSettings, MethodSettings, ScheduleSettings
 
+PLAIN = RunSettings(MethodSettings(), ScheduleSettings(), 0)
+
 
 def make(step: int = 10, settings: RunSettings | None = None) -> Checkpoint:
     text = canonical_json(settings or RunSettings(MethodSettings(), ScheduleSettings(), 0))
@@ -180,7 +182,7 @@ def test_other_settings_are_refused_by_key():
     base = RunSettings(MethodSettings(), ScheduleSettings(), 0)
     other = replace(base, method=replace(base.method, loss=LossSettings(l1=0.5)), seed=1)
     with pytest.raises(CheckpointError, match=r"method\.loss\.l1: 0\.8 then, 0\.5 now; seed: 0 then, 1 now"):
-        check_resumable(make(settings=base).record, make(settings=other).record, warn=pytest.fail)
+        check_resumable(make(settings=base).record, make(settings=other).record, base, warn=pytest.fail)
 
 
 def test_a_setting_that_is_new_since_the_checkpoint_counts_as_its_default():
@@ -188,28 +190,30 @@ def test_a_setting_that_is_new_since_the_checkpoint_counts_as_its_default():
     old = json.loads(record.settings)
     assert old["method"]["optics"].pop("blend") == "srgb"
     before = replace(record, settings=json.dumps(old, sort_keys=True), settings_digest="another")
-    check_resumable(before, record, warn=pytest.fail)
-    check_resumable(record, before, warn=pytest.fail)
+    check_resumable(before, record, PLAIN, warn=pytest.fail)
+    check_resumable(record, before, PLAIN, warn=pytest.fail)
     other = replace(record, settings=record.settings.replace('"srgb"', '"linear"'), settings_digest="a third")
     with pytest.raises(CheckpointError, match=r"method\.optics\.blend: srgb then, linear now"):
-        check_resumable(before, other, warn=pytest.fail)
+        check_resumable(before, other, PLAIN, warn=pytest.fail)
     del old["method"]["optics"]["weight"]
     with pytest.raises(CheckpointError, match=r"method\.optics\.weight: None then"):  # not marked as a later one
-        check_resumable(replace(before, settings=json.dumps(old)), record, warn=pytest.fail)
+        check_resumable(replace(before, settings=json.dumps(old)), record, PLAIN, warn=pytest.fail)
 
 
 def test_another_scene_is_refused():
     record = make().record
     with pytest.raises(CheckpointError, match="another scene or resolution"):
-        check_resumable(record, replace(record, scene_digest="else"), warn=pytest.fail)
+        check_resumable(record, replace(record, scene_digest="else"), PLAIN, warn=pytest.fail)
 
 
 def test_another_machine_is_a_warning():
     record = make().record
     warnings: list[str] = []
-    check_resumable(record, record, warn=warnings.append)
+    check_resumable(record, record, PLAIN, warn=warnings.append)
     assert warnings == []
-    check_resumable(record, replace(record, threads=1, isa="avx512", versions=(("torch", "3"),)), warn=warnings.append)
+    check_resumable(
+        record, replace(record, threads=1, isa="avx512", versions=(("torch", "3"),)), PLAIN, warn=warnings.append
+    )
     assert len(warnings) == 1
     for part in ("threads: 2 then, 1 now", "instruction set: avx2 then, avx512 now", "torch: 2 then, 3 now"):
         assert part in warnings[0]

@@ -45,8 +45,8 @@ checkpoint.os.rename = dying(checkpoint.os.rename)
 trainer = small_trainer(schedule=small_schedule(60), checkpoint_dir=Path(sys.argv[1]))
 after_step = trainer.method.after_step
 
-def telling(step):
-    events = after_step(step)
+def telling(step, observations):
+    events = after_step(step, observations)
     print("step", step, flush=True)
     return events
 
@@ -123,10 +123,10 @@ def test_the_numbers_shown_to_the_user_go_on_too(tmp_path: Path):
     trainer = small_trainer(schedule=small_schedule(TOTAL), checkpoint_dir=tmp_path)
     after_step = trainer.method.after_step
 
-    def interrupted(step: int):
+    def interrupted(step: int, observations):
         if step == 40:
             raise KeyboardInterrupt
-        return after_step(step)
+        return after_step(step, observations)
 
     trainer.method.after_step = interrupted  # type: ignore[method-assign]
     with pytest.raises(KeyboardInterrupt):

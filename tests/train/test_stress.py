@@ -8,6 +8,7 @@ import pytest
 import torch
 from training_cases import small_method, small_scene, small_schedule, small_trainer
 
+from rtgs.train.method import Mode
 from rtgs.train.settings import OptimizerSettings
 
 
@@ -27,13 +28,13 @@ def test_2000_steps_at_30_times_the_learning_rates_on_noise_stay_finite(name: st
     trainer.run()  # the guard stops at any non-finite loss or gradient
     base = trainer.method.sets[0]
     assert len(base) > 0
-    for key, tensor in base.surfels.items():
+    for key, tensor in base.gaussians.items():
         assert bool(torch.isfinite(tensor).all()), key
     limits = settings.optimizer
-    assert float(base.surfels.opacity_logits.detach().abs().max()) <= limits.opacity_logit_limit + 1e-5
-    scales = base.surfels.log_scales.detach().exp()
+    assert float(base.gaussians.opacity_logits.detach().abs().max()) <= limits.opacity_logit_limit + 1e-5
+    scales = base.gaussians.log_scales.detach().exp()
     assert float(scales.max()) <= limits.largest_scale * scene.extent * 1.001
     assert float(scales.min()) >= limits.smallest_scale * scene.extent * 0.999
     for view in (*scene.train, *scene.test):
         with torch.no_grad():
-            assert bool(torch.isfinite(trainer.method.render(view.camera, 2000).image).all())
+            assert bool(torch.isfinite(trainer.method.render(view.camera, 2000, Mode.TRAIN).image).all())

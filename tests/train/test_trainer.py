@@ -76,7 +76,7 @@ def test_equal_seeds_give_equal_surfels_and_others_do_not():
     def means(seed: int) -> torch.Tensor:
         trainer = small_trainer(schedule=small_schedule(25), seed=seed)
         trainer.run()
-        return trainer.method.sets[0].surfels.means.detach()
+        return trainer.method.sets[0].gaussians.means.detach()
 
     assert torch.equal(means(1), means(1))
     assert not torch.equal(means(1)[:100], means(2)[:100])
@@ -115,7 +115,7 @@ def test_a_nan_pixel_stops_training_names_the_term_and_leaves_the_checkpoint(tmp
 
 def test_a_nan_gradient_stops_training_and_names_parameter_and_surfels():
     trainer = small_trainer(schedule=small_schedule())
-    surfels = trainer.method.sets[0].surfels
+    surfels = trainer.method.sets[0].gaussians
 
     def poison(gradient: torch.Tensor) -> torch.Tensor:
         gradient = gradient.clone()
@@ -134,12 +134,12 @@ def test_a_nan_gradient_stops_training_and_names_parameter_and_surfels():
 def test_a_nan_densification_signal_stops_training_too():
     trainer = small_trainer(schedule=small_schedule())
     base = trainer.method.sets[0]
-    watch = base.watch
+    observe = base.density.observe
 
-    def poisoned(probe: torch.Tensor, weight_sum: torch.Tensor) -> None:
-        watch(probe, torch.where(torch.arange(len(weight_sum)) == 5, math.nan, weight_sum))
+    def poisoned(signal: torch.Tensor, weight_sum: torch.Tensor) -> None:
+        observe(signal, torch.where(torch.arange(len(weight_sum)) == 5, math.nan, weight_sum))
 
-    base.watch = poisoned  # type: ignore[method-assign]
+    base.density.observe = poisoned  # type: ignore[method-assign]
     with pytest.raises(TrainingDiverged, match=r"densification signal or weight sum of 1 surfels .* \[5\]"):
         trainer.run()
 
@@ -155,10 +155,10 @@ def test_metrics_are_flushed_when_training_breaks():
     trainer = small_trainer(settings=settings, schedule=small_schedule(40), recorder=memory, progress=memory)
     after_step = trainer.method.after_step
 
-    def failing(step: int):
+    def failing(step: int, observations):
         if step == 30:
             raise KeyboardInterrupt
-        return after_step(step)
+        return after_step(step, observations)
 
     trainer.method.after_step = failing  # type: ignore[method-assign]
     with pytest.raises(KeyboardInterrupt):

@@ -8,19 +8,19 @@ import torch
 
 from rtgs.gaussians.density import logit
 from rtgs.gaussians.materials import MaterialSurfels
-from rtgs.methods.base import StepEvent
-from rtgs.methods.surfel_set import SurfelSet
+from rtgs.methods.parts.gaussian_set import GaussianSet
+from rtgs.train.method import StepEvent
 from rtgs.train.specular_settings import PropagationSettings
 
 
 @torch.no_grad()
-def propagate_normals(base: SurfelSet, settings: PropagationSettings, generator: torch.Generator) -> StepEvent:
+def propagate_normals(base: GaussianSet, settings: PropagationSettings, generator: torch.Generator) -> StepEvent:
     """Make every surfel opaque, specular ones larger, and add noise to the colour of the others.
 
     Opaque surfels with a good normal cover their neighbours, so that these learn theirs; the noise undoes what a matte
     colour has baked in, so that reflection has something left to explain. Moments of what changed become 0.
     """
-    surfels = base.surfels
+    surfels = base.gaussians
     assert isinstance(surfels, MaterialSurfels)
     specular = surfels.specular_logits.sigmoid()
     surfels.opacity_logits.clamp_(min=logit(settings.opacity))
@@ -38,9 +38,9 @@ def propagate_normals(base: SurfelSet, settings: PropagationSettings, generator:
 
 
 @torch.no_grad()
-def reset_specular(base: SurfelSet, specular: float) -> None:
+def reset_specular(base: GaussianSet, specular: float) -> None:
     """k_s becomes min(k_s, its initial value), as EnvGS does (3DGS-DR raises it instead); its moments become 0."""
-    surfels = base.surfels
+    surfels = base.gaussians
     assert isinstance(surfels, MaterialSurfels)
     surfels.specular_logits.clamp_(max=logit(specular))
     base.optimizer.zero_moments("specular_logits")

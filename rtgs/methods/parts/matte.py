@@ -12,8 +12,8 @@ from torch import Tensor
 from rtgs.train.specular_settings import MatteSettings
 
 if TYPE_CHECKING:
-    from rtgs.methods.base import RenderedView
     from rtgs.scenes.scene import View
+    from rtgs.train.method import RenderedView
 
 
 @dataclass(frozen=True)

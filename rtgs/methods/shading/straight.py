@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from rtgs.mesh.container import ObjectSurfaces
-from rtgs.methods.base import FirstBounce
-from rtgs.methods.mirror import SHORTEST_NORMAL, SurfacePixels
+from rtgs.methods.shading.mirror import SHORTEST_NORMAL, SurfacePixels, pixel_weights
+from rtgs.optics.settings import OpticsSettings
+from rtgs.train.method import FirstBounce, Observation
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,7 @@ class Transmission:
 
     color: Tensor  # (3, P) C_t of the traced pixels; 0 outside the object
     first_bounce: FirstBounce | None  # in training, for rays with a second surface
+    observations: tuple[Observation, ...] = ()  # in training, of the transmittance set
 
 
 def glass_pixels(
@@ -86,6 +88,25 @@ def glass_rays(glass: GlassPixels, index: Tensor, center: Tensor, view: Tensor) 
     near = glass.flat.depth.detach()[pixels]
     directions = view[:, pixels].T.contiguous()
     return GlassRays(rows, len(index), center, directions, near, glass.far[pixels], glass.second[pixels])
+
+
+def glass_weights(
+    reflection: Tensor, cosine: Tensor, pixels: SurfacePixels, inside: Tensor, optics: OpticsSettings, largest: float
+) -> tuple[Tensor, Tensor]:
+    """w_r and w_t of P traced pixels (method.md 4.4): w_t is 0 outside the object, w_r inside at most ``largest``.
+
+    Args:
+        reflection: (P,) or (3, P) w_r as outside the object.
+        cosine: (P,) n . omega_o; inside: (P,) bool.
+        optics: with the S_max of the object's pixels.
+        largest: 0: no bound.
+    """
+    rows = inside.nonzero()[:, 0]
+    shown = replace(pixels, roughness=pixels.roughness[rows], f0=pixels.f0.index_select(-1, rows))
+    weights = pixel_weights(cosine[rows], shown, optics)
+    own = weights.reflection.clamp_max(largest) if largest > 0 else weights.reflection
+    passed = torch.zeros_like(reflection).index_copy(-1, rows, weights.transmission)
+    return reflection.index_copy(-1, rows, own), passed
 
 
 def depth_loss(bounce: FirstBounce, form: str, pixels: int) -> Tensor:

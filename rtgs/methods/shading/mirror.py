@@ -101,6 +101,23 @@ def reflected_weight(cosine: Tensor, pixels: SurfacePixels, optics: OpticsSettin
     return reflection_weight(cosine, pixels.roughness, pixels.f0.T, optics).T
 
 
+def surface_there(pixels: SurfacePixels, alpha: Tensor, smallest_alpha: float) -> Tensor:
+    """(P,) bool: there is a surface to reflect at: enough coverage, a depth, a normal."""
+    there = (alpha > smallest_alpha) & (pixels.depth > 0)
+    return there & (pixels.normal.square().sum(0) > SHORTEST_NORMAL**2)
+
+
+def showing_reflection(pixels: SurfacePixels, view: Tensor, optics: OpticsSettings) -> Tensor:
+    """(P,) k_s max(w_r, 1): how much of a reflection each pixel may show; ``view`` (3, P) world rays."""
+    if optics.at_most_one:
+        return pixels.specular
+    unit = pixels.normal / pixels.normal.square().sum(0).sqrt().clamp_min(SHORTEST_NORMAL)
+    cosine = -(unit * view).sum(0) / view.square().sum(0).sqrt()
+    weight = pixel_weights(cosine, pixels, optics).reflection
+    weight = weight if weight.ndim == 1 else weight.amax(0)
+    return pixels.specular * weight.clamp_min(1)
+
+
 def specular_change(pixels: SurfacePixels, light: Tensor, emphasis: Tensor | None, blend: str = "srgb") -> Tensor:
     """(3, P) what traced light adds to C_d: k_s (light - C_d), so that C_d plus it is (1 - k_s) C_d + k_s light.
 

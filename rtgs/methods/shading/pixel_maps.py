@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
-from rtgs.methods.base import SpecularLayers
-from rtgs.methods.mirror import SurfacePixels
-from rtgs.methods.traced_pixels import TracedPixels
+from rtgs.methods.shading.mirror import SurfacePixels
+from rtgs.methods.shading.traced_pixels import TracedPixels
+from rtgs.train.method import SpecularLayers
 
 
 def full_map(values: Tensor, chosen: TracedPixels, shape) -> Tensor:
     """(3, P) values of the traced pixels as a picture, 0 elsewhere."""
     return torch.zeros(3, shape[1] * shape[2]).index_copy(1, chosen.index, values).reshape(shape)
+
+
+def full_view(diffuse: Tensor, chosen: TracedPixels, change: Tensor, shape) -> Tensor:
+    """The image: C_d (3, H * W) with the ``change`` (3, P) of the traced pixels."""
+    return diffuse.index_add(1, chosen.index, change).reshape(shape)
 
 
 def take_pixels(pixels: SurfacePixels, index: Tensor) -> SurfacePixels:
@@ -36,3 +43,11 @@ def specular_layers(
         f0=flat.f0.reshape(*flat.f0.shape[:-1], *shape[1:]),
         traced=traced.reshape(shape[1:]),
     )
+
+
+def add_transmission(
+    layers: SpecularLayers, chosen: TracedPixels, transmission: Tensor, color: Tensor, shape
+) -> SpecularLayers:
+    """The layers with what was seen through transparent objects: (3, P) weighted, and C_t itself."""
+    both = (full_map(values.detach(), chosen, shape) for values in (transmission, color))
+    return replace(layers, **dict(zip(("transmission", "transmitted_color"), both, strict=True)))

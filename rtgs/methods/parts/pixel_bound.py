@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
-from rtgs.methods.base import Decision
+from rtgs.core.decisions import Decision
 from rtgs.train.settings import DensitySettings, MethodSettings
 
 

@@ -15,8 +15,8 @@ from rtgs.gaussians.initialize import points_box
 from rtgs.gaussians.materials import MaterialSurfels, without_materials
 from rtgs.gaussians.surfels import Surfels
 from rtgs.mesh.container import ObjectMesh
-from rtgs.methods.surfel_set import SurfelSet
-from rtgs.methods.traced_set import stratified_surfels
+from rtgs.methods.parts.gaussian_set import GaussianSet
+from rtgs.methods.parts.stratified import stratified_surfels
 from rtgs.train.settings import TransmittanceSettings
 
 
@@ -37,12 +37,12 @@ def rows_inside(surfels: Surfels, mesh: ObjectMesh, margin: float, cameras: Sequ
 
 
 @torch.no_grad()
-def take_out(base: SurfelSet, rows: Tensor, kept: Tensor) -> Surfels:
+def take_out(base: GaussianSet, rows: Tensor, kept: Tensor) -> Surfels:
     """Remove the surfels ``rows`` (N,) bool of the base set, with their moments, and return them without materials;
     those that are ``kept`` (N,) bool are copied."""
-    taken = select_rows(base.surfels, rows)
-    nothing = select_rows(base.surfels, torch.zeros(0, dtype=torch.int64))
-    apply_plan(RowPlan((~rows | kept).nonzero()[:, 0], nothing), base.surfels, base.optimizer, base.density)
+    taken = select_rows(base.gaussians, rows)
+    nothing = select_rows(base.gaussians, torch.zeros(0, dtype=torch.int64))
+    apply_plan(RowPlan((~rows | kept).nonzero()[:, 0], nothing), base.gaussians, base.optimizer, base.density)
     return without_materials(taken) if isinstance(taken, MaterialSurfels) else taken  # type: ignore[return-value]
 
 

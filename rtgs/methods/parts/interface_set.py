@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import torch
@@ -15,13 +16,13 @@ from rtgs.gaussians.materials import MaterialSurfels, with_materials
 from rtgs.gaussians.primitives import tangents
 from rtgs.gaussians.surfels import Surfels
 from rtgs.mesh.container import ObjectMesh
-from rtgs.methods.surfel_set import SurfelSet
+from rtgs.methods.parts.gaussian_set import GaussianSet
 from rtgs.train.settings import MethodSettings
 
 _NORMALS = "normals"  # in the state
 
 
-class InterfaceSet(SurfelSet):
+class InterfaceSet(GaussianSet):
     """A set without density control whose opacities stay at or above ``floor``.
 
     ``normals``: (N, 3) unit, those that the surfels were put on the mesh with.
@@ -41,12 +42,12 @@ class InterfaceSet(SurfelSet):
         return (1 - (self._normals() * self.normals).sum(-1)).mean()
 
     def _normals(self) -> Tensor:
-        return torch.linalg.cross(*tangents(self.surfels.quaternions))
+        return torch.linalg.cross(*tangents(self.gaussians.quaternions))
 
     def state(self) -> dict[str, Tensor]:
         return super().state() | {f"{self.name}.{_NORMALS}": self.normals}
 
-    def load(self, state: dict[str, Tensor]) -> None:
+    def load(self, state: Mapping[str, Tensor]) -> None:
         super().load(state)
         key = f"{self.name}.{_NORMALS}"
         if key not in state:
@@ -58,7 +59,7 @@ class InterfaceSet(SurfelSet):
     @torch.no_grad()
     def _clamp(self) -> None:
         super()._clamp()
-        self.surfels.opacity_logits.clamp_(min=logit(self.floor))
+        self.gaussians.opacity_logits.clamp_(min=logit(self.floor))
 
 
 def normal_quaternions(normals: Tensor) -> Tensor:

@@ -1,0 +1,87 @@
+"""One stage of a method on a scene: the one kind of step that trains, whatever the method."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from pipelines.steps.extract_mesh import why_absent
+from pipelines.steps.training import StageParams, last_training, load_method, train_stage
+from rtgs.methods import MethodSpec, StageSpec, find_method, own_methods
+from rtgs.workflow import Step, StepContext, StepKind
+
+if TYPE_CHECKING:
+    from rtgs.evaluate.boundary import BoundaryScores
+
+BOUNDARY_FILE = "boundary.json"
+MESH_STEP = "extract_mesh"
+
+
+def train(params: StageParams, context: StepContext) -> None:
+    """Train one stage, going on from the stage before it where there is one.
+
+    Writes what :func:`pipelines.steps.training.train_stage` writes. With the mesh of a transparent object among its
+    inputs also ``object_mesh/`` (a copy of it: whoever loads the method needs this artifact alone) and
+    ``boundary.json``: how well the object's surface is known where the stage begins and where it ends
+    (:class:`rtgs.evaluate.boundary.BoundaryScores`). Where there is no transparent object after all, the stage before
+    goes on to the end, bit for bit as in a run without this one, and there is neither.
+
+    Raises:
+        TrainingDiverged: a loss or gradient is not finite.
+    """
+    if MESH_STEP not in context.inputs:
+        train_stage(params, context)
+    elif why := why_absent(context.inputs[MESH_STEP]):
+        context.log.info("no %s stage, the one before goes on: %s", params.stage, why)
+        train_stage(_without_object(params), context)
+    else:
+        _train_with_object(params, context)
+
+
+def _train_with_object(params: StageParams, context: StepContext) -> None:
+    from rtgs.evaluate.boundary import boundary_scores
+    from rtgs.mesh.container import read_object_mesh
+    from rtgs.scenes.canonical import read_scene
+
+    scene = read_scene(context.inputs["import_scene"])
+    mesh = read_object_mesh(context.inputs[MESH_STEP])
+    before, stage = load_method(last_training(context.inputs), scene)
+    scores = {"before": boundary_scores(before, scene, mesh, stage.until)}
+    del before
+    method = train_stage(params, context, mesh)
+    scores["after"] = boundary_scores(method, scene, mesh, params.until)
+    text = json.dumps({when: vars(values) for when, values in scores.items()}, indent=1)
+    (context.out / BOUNDARY_FILE).write_text(text + "\n", encoding="utf-8")
+    for when, values in scores.items():
+        context.log.info("%s the %s stage: %s", when, params.stage, values)
+        context.tracker.metrics(_numbers(values, when))
+
+
+def _without_object(params: StageParams) -> StageParams:
+    """Those of the stage before, lasting as long as the whole run; it is met on its way, at ``params.from_step``."""
+    spec = find_method(params.method.name)
+    before = spec.timeline(params.method, params.schedule)[-1]
+    own = spec.stage(before.name).reads(params.method)
+    return replace(params, method=own, stage=before.name, from_step=before.from_step)
+
+
+def _numbers(scores: BoundaryScores, when: str) -> dict[str, float]:
+    return {f"boundary/{when}/{name}": value for name, value in vars(scores).items() if isinstance(value, float)}
+
+
+def kind_of(stage: StageSpec) -> StepKind:
+    """The step that trains a stage: ``train_<name>``, with the stage's version."""
+    return StepKind(f"train_{stage.name}", stage.version, train)
+
+
+def train_step(spec: MethodSpec, params: StageParams, *upstream: Step) -> Step:
+    """The step of one stage of a method."""
+    return kind_of(spec.stage(params.stage)).step(params, *upstream)
+
+
+def training_kinds(specs: Iterable[MethodSpec] | None = None) -> tuple[StepKind, ...]:
+    """The kinds of the stages of these methods (default: those of this package), each once."""
+    stages = (stage for spec in (own_methods() if specs is None else specs) for stage in spec.stages)
+    return tuple({kind.name: kind for kind in map(kind_of, stages)}.values())

@@ -1,0 +1,222 @@
+"""The loss terms of the surfel family (method.md 5): each a :class:`~rtgs.train.terms.LossTerm`, or why there is none.
+
+A method's module chooses from them, and may add terms of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from rtgs.core.cameras import Camera
+from rtgs.core.decisions import Decision
+from rtgs.methods.parts.base import BaseSet
+from rtgs.methods.parts.glass import Glass
+from rtgs.methods.shading.straight import depth_loss, mesh_normal_loss
+from rtgs.pretrained.weights import MissingWeights
+from rtgs.render.buffers import RasterBuffers
+from rtgs.train.losses import (
+    distortion_loss,
+    inverse_depth_weights,
+    mono_normal_loss,
+    normal_consistency_loss,
+    surface_depth,
+)
+from rtgs.train.method import RenderedView, RenderOptions
+from rtgs.train.perceptual import PerceptualLoss
+from rtgs.train.schedule import loss_start
+from rtgs.train.settings import LossSettings, MethodSettings
+from rtgs.train.terms import LossTerm, term_start
+
+if TYPE_CHECKING:
+    from rtgs.methods.model import Setup
+    from rtgs.scenes.scene import View
+
+Terms = Sequence[LossTerm | Decision]
+SURFACE_LOSSES = ("normal", "mono_normal", "distortion")
+
+
+def refuse_surface_losses(settings: MethodSettings) -> None:
+    """For Gaussians that have no surface.
+
+    Raises:
+        ValueError: a loss is on that needs one.
+    """
+    for name in SURFACE_LOSSES:
+        if weight := getattr(settings.loss, name):
+            raise ValueError(
+                f"method.loss.{name}={weight:g}, but the ellipsoids of method {settings.name} have no surface to "
+                "compare with: set it to 0, or use method=2dgs"
+            )
+
+
+def surface_terms(setup: Setup) -> Terms:
+    """Normal consistency, monocular normals, distortion (method.md 5)."""
+    loss, ratio = setup.settings.loss, setup.settings.render.depth_ratio
+
+    def start(name: str, weight: float, share: float) -> int | Decision:
+        return term_start(name, weight, share, setup.schedule.total, setup.settings.name)
+
+    def consistency(rendered: RenderedView, view: View) -> Tensor:
+        return _normal_consistency(rendered.buffers, rendered.camera, loss, ratio)
+
+    def mono(rendered: RenderedView, view: View) -> Tensor | None:
+        return None if view.normal is None else _mono_normal(rendered.buffers, view, rendered.camera, loss)
+
+    def distortion(rendered: RenderedView, view: View) -> Tensor:
+        assert rendered.buffers.distortion is not None
+        return distortion_loss(rendered.buffers.distortion)
+
+    both = RenderOptions(depth=ratio < 1, median_depth=ratio > 0, normal=True)
+    normals = RenderOptions(depth=loss.normal_inverse_depth, normal=True)
+    found: list[LossTerm | Decision] = []
+    for name, first, term in (
+        ("normal", start("normal consistency", loss.normal, loss.normal_start), (loss.normal, consistency, both)),
+        (
+            "mono_normal",
+            _mono_start(setup, start("monocular normal", loss.mono_normal, loss.mono_normal_start), found),
+            (loss.mono_normal * loss.mono_normal_gain, mono, normals),
+        ),
+        (
+            "distortion",
+            start("distortion", loss.distortion, loss.distortion_start),
+            (loss.distortion, distortion, RenderOptions(distortion=True)),
+        ),
+    ):
+        weight, value, needs = term
+        found.append(first if isinstance(first, Decision) else LossTerm(name, weight, value, first, needs=needs))
+    return found
+
+
+def _mono_start(setup: Setup, start: int | Decision, found: list[LossTerm | Decision]) -> int | Decision:
+    """``start`` where training views have normal maps; says where some have not."""
+    scene = setup.scene
+    without = sum(view.normal is None for view in scene.train)
+    if isinstance(start, Decision) or not without:
+        return start
+    if without == len(scene.train):
+        why = f"no training view has a normal map in scene {scene.name}"
+        return Decision("no monocular normal loss", why)
+    why = f"{without} of {len(scene.train)} training views lack a normal map in scene {scene.name}"
+    found.append(Decision("no monocular normal loss on some views", why))
+    return start
+
+
+def _normal_consistency(buffers: RasterBuffers, camera: Camera, loss: LossSettings, ratio: float) -> Tensor:
+    """L_norm with the surface depth that ``render.depth_ratio`` asks for."""
+    assert buffers.normal is not None
+    depth = buffers.alpha if buffers.depth is None else buffers.depth  # unused at ratio 1
+    return normal_consistency_loss(
+        buffers.normal,
+        depth,
+        buffers.alpha,
+        camera,
+        inverse_depth_weight=loss.normal_inverse_depth,
+        depth_override=surface_depth(depth, buffers.alpha, buffers.median_depth, ratio) if ratio > 0 else None,
+    )
+
+
+def _mono_normal(buffers: RasterBuffers, view: View, camera: Camera, loss: LossSettings) -> Tensor:
+    """L_mono, depth-weighted like L_norm (method.md 5); transparent objects may count more."""
+    assert buffers.normal is not None
+    assert view.normal is not None
+    weight = None
+    if loss.normal_inverse_depth:
+        assert buffers.depth is not None
+        weight = inverse_depth_weights(buffers.depth, buffers.alpha)
+    if loss.mono_normal_masked != 1 and view.mask is not None:
+        masked = torch.where(view.mask, loss.mono_normal_masked, 1.0)
+        weight = masked if weight is None else weight * masked
+    return mono_normal_loss(buffers.normal, view.normal, camera, form=loss.mono_normal_form, weight=weight)
+
+
+def mcmc_terms(base: BaseSet, setup: Setup) -> Terms:
+    """Opacity and scale of all base Gaussians, where MCMC is the density strategy (Kheradmand et al. 2024, eq. 10)."""
+    mcmc, extent = base.mcmc, setup.scene.extent
+    if mcmc is None:
+        return ()
+
+    def opacity(rendered: RenderedView, view: View) -> Tensor:
+        return base.set.gaussians.opacity_logits.sigmoid().mean()
+
+    def scale(rendered: RenderedView, view: View) -> Tensor:
+        return base.set.gaussians.log_scales.exp().mean() / extent
+
+    both = (("opacity", mcmc.opacity_loss, opacity), ("scale", mcmc.scale_loss, scale))
+    return [LossTerm(name, weight, value) for name, weight, value in both if weight > 0]
+
+
+def perceptual_terms(setup: Setup) -> Terms:
+    """L_perc of views with reflection, where its weights are there (decision 20); else why it is left out."""
+    loss = setup.settings.loss
+    if loss.perceptual == 0:
+        return ()
+    try:
+        perceptual = PerceptualLoss(loss)
+    except MissingWeights as error:
+        return (Decision("no perceptual loss", str(error).splitlines()[0]),)
+
+    def value(rendered: RenderedView, view: View) -> Tensor | None:
+        return None if rendered.specular is None else perceptual(rendered.image, view.image, setup.generator)
+
+    start = loss_start(loss.perceptual_start, setup.schedule.total)
+    return (LossTerm("perceptual", loss.perceptual, value, start),)
+
+
+def masked_pixels(view: View) -> Tensor | None:
+    """(H, W) bool: the view's own mask."""
+    return view.mask
+
+
+def specular_terms(setup: Setup, mask: Callable[[View], Tensor | None] = masked_pixels) -> Terms:
+    """L_spec in ``mask`` of a view, where it is one of transparent objects (decisions 9, 10)."""
+    loss = setup.settings.loss
+    if loss.specular == 0 or not setup.settings.transmittance.enabled:
+        return ()
+
+    def value(rendered: RenderedView, view: View) -> Tensor | None:
+        where = None if rendered.specular is None else mask(view)
+        if where is None or rendered.specular is None:
+            return None
+        return (where * (loss.specular_target - rendered.specular).clamp_min(0)).mean()
+
+    return (LossTerm("specular", loss.specular, value, loss_start(loss.specular_start, setup.schedule.total)),)
+
+
+def glass_terms(setup: Setup, glass: Glass) -> Terms:
+    """L_d, and what holds the interface's normals (method.md 5.1)."""
+    loss, interface = setup.settings.loss, setup.settings.transmittance.interface
+
+    def depth(rendered: RenderedView, view: View) -> Tensor | None:
+        if rendered.first_bounce is None:
+            return None
+        pixels = rendered.camera.height * rendered.camera.width
+        return depth_loss(rendered.first_bounce, loss.transmission_depth_form, pixels)
+
+    def hold(rendered: RenderedView, view: View) -> Tensor | None:
+        return None if glass.interface is None else glass.interface.turned()
+
+    def normal(rendered: RenderedView, view: View) -> Tensor | None:
+        """1 - n . N where the object is seen; n rasterised, N of the mesh."""
+        if glass.interface is None or glass.guide is None or rendered.transparent is None:
+            return None
+        surfaces = glass.guide.surfaces(rendered.camera)
+        assert rendered.buffers.normal is not None
+        return mesh_normal_loss(
+            rendered.buffers.normal, surfaces.normal, rendered.transparent & glass.on_glass(surfaces)
+        )
+
+    until = loss_start(interface.normal_loss_until, setup.schedule.total)
+    found = (
+        ("transmission_depth", loss.transmission_depth, depth, None),
+        ("interface_hold", interface.normal_hold, hold, until),
+        ("interface_normal", interface.normal_loss, normal, until),
+    )
+    return [
+        LossTerm(name, weight, value) if end is None else LossTerm(name, weight, value, until=end)
+        for name, weight, value, end in found
+        if weight > 0
+    ]

@@ -1,0 +1,198 @@
+"""The model of a method: parts that are rendered and trained together. The one class that every method's spec composes.
+
+A part is a set of Gaussians with what belongs to it (:mod:`rtgs.methods.parts`). Parts know those they are given, never
+the method they are in; the model asks them in order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from rtgs.core.cameras import Camera
+from rtgs.core.decisions import Decision
+from rtgs.methods.parts.base import BaseSet
+from rtgs.methods.parts.gaussian_set import GaussianSet
+from rtgs.methods.parts.part import Frame, Part, Raster
+from rtgs.train.method import (
+    LossValues,
+    Mode,
+    Observation,
+    RenderedView,
+    RenderOptions,
+    Stage,
+    StepEvent,
+)
+from rtgs.train.parameters import ParameterGroup
+from rtgs.train.terms import LossTerm, table_of
+
+if TYPE_CHECKING:
+    from rtgs.mesh.container import ObjectMesh
+    from rtgs.methods.spec import MethodSpec
+    from rtgs.scenes.scene import Scene, View
+    from rtgs.train.settings import MethodSettings, ScheduleSettings
+
+NO_OPTIONS = RenderOptions()
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What a method is composed from.
+
+    Attributes:
+        settings: with caps as this scene's pictures bound them.
+        generator: drawn from at initialisation, in training views and by density control; it travels in checkpoints.
+        object_mesh: of the scene's transparent object, for methods with a stage that needs it; None: without it.
+        stages: of this run.
+        decisions: what was lowered in the settings.
+    """
+
+    spec: MethodSpec
+    settings: MethodSettings
+    scene: Scene
+    schedule: ScheduleSettings
+    generator: torch.Generator
+    object_mesh: ObjectMesh | None = None
+    stages: tuple[Stage, ...] = ()
+    decisions: tuple[Decision, ...] = field(default=())
+
+
+class Model:
+    """What trains (:class:`rtgs.train.method.Method`): the parts of a method and its loss."""
+
+    def __init__(self, setup: Setup, parts: Sequence[Part], terms: Iterable[LossTerm | Decision] = ()) -> None:
+        """``parts`` in the order in which they join, the base set first; ``terms`` in the order of the log, and in the
+        place of those that this run is without, why."""
+        first, *_ = parts
+        if not isinstance(first, BaseSet):
+            raise TypeError(f"the first part of method {setup.spec.name} is a {type(first).__name__}, not a BaseSet")
+        self.spec = setup.spec
+        self.settings = setup.settings
+        self.schedule = setup.schedule
+        self.stages = setup.stages
+        self.generator = setup.generator
+        self.extent = setup.scene.extent
+        self.parts = {part.name: part for part in parts}
+        self.base = first
+        found = tuple(terms)
+        self.loss = table_of(setup.settings.loss, (term for term in found if isinstance(term, LossTerm)))
+        self._decisions = (*(term for term in found if isinstance(term, Decision)), *setup.decisions)
+
+    # ---- what there is
+
+    @property
+    def name(self) -> str:
+        """The method's name."""
+        return self.spec.name
+
+    @property
+    def maps(self) -> tuple[str, ...]:
+        """Of :class:`RenderOptions`, those that :meth:`render` can give."""
+        return self.base.kind.maps
+
+    @property
+    def decisions(self) -> tuple[Decision, ...]:
+        """What this run does without or differently, as far as it is known by now."""
+        return (*self._decisions, *(each for part in self.parts.values() for each in part.decisions))
+
+    @property
+    def sets(self) -> tuple[GaussianSet, ...]:
+        """The sets of Gaussians in training."""
+        return tuple(each for part in self.parts.values() for each in part.sets)
+
+    @property
+    def groups(self) -> tuple[ParameterGroup, ...]:
+        """The groups of tensors in training that are no rows of Gaussians."""
+        return tuple(each for part in self.parts.values() for each in part.groups)
+
+    def find(self, name: str) -> GaussianSet | None:
+        """The set of this name; None while there is none."""
+        return next((each for each in self.sets if each.name == name), None)
+
+    def __getitem__(self, name: str) -> GaussianSet:
+        """The set of this name.
+
+        Raises:
+            KeyError: there is none, at present.
+        """
+        found = self.find(name)
+        if found is None:
+            raise KeyError(f"method {self.spec.name} has no set {name!r} now: it has {[s.name for s in self.sets]}")
+        return found
+
+    def recipe(self, stage: str) -> MethodSettings:
+        """The settings as the stage of this name reads them."""
+        return self.spec.stage(stage).reads(self.settings)
+
+    # ---- training
+
+    def begin(self, stage: Stage) -> tuple[StepEvent, ...]:
+        """Every part takes up its work of the stage."""
+        return tuple(event for part in self.parts.values() for event in part.begin(stage))
+
+    def render(
+        self,
+        camera: Camera,
+        step: int,
+        mode: Mode,
+        options: RenderOptions = NO_OPTIONS,
+        mask: Tensor | None = None,
+    ) -> RenderedView:
+        """Render one view (:meth:`rtgs.train.method.Method.render`)."""
+        frame = Frame(camera, step, mode, options, mask)
+        raster = self.rasterize(frame)
+        for part in reversed(self.parts.values()):
+            if (shaded := part.shade(frame, raster)) is not None:
+                return shaded
+        raise RuntimeError(f"no part of method {self.spec.name} shades")  # the base set always does
+
+    def rasterize(self, frame: Frame) -> Raster:
+        """The base set's maps: those asked for, those the losses of this step need, those that parts shade with."""
+        wanted = frame.options.plus(self.loss.needs(frame.step)) if frame.training else frame.options
+        for part in self.parts.values():
+            wanted = wanted.plus(part.needs(frame))
+        appended = [rows for part in self.parts.values() if (rows := part.appended(frame)) is not None]
+        return self.base.rasterize(frame, wanted, appended)
+
+    def losses(self, rendered: RenderedView, view: View, step: int) -> LossValues:
+        """L1 and D-SSIM always, the other terms while they act (method.md 5)."""
+        return self.loss.evaluate(rendered, view, step)
+
+    def after_step(self, step: int, observations: tuple[Observation, ...]) -> tuple[StepEvent, ...]:
+        """Adam on all parts, then what they decide and change before step ``step + 1``.
+
+        Raises:
+            NonFiniteGradientError: a gradient held NaN or inf.
+            RtgsError: density control left no Gaussian.
+        """
+        seen = {each.set_name: each for each in observations}
+        for part in self.parts.values():
+            part.step(step, seen)
+        return tuple(self._between(step + 1))
+
+    def _between(self, following: int) -> Iterator[StepEvent]:
+        for part in self.parts.values():
+            yield from part.judge(following)
+        for part in self.parts.values():
+            yield from part.control(following)
+
+    # ---- state
+
+    def state(self) -> dict[str, Tensor]:
+        """Flat mapping of every tensor that training needs to go on, generator included."""
+        tensors = {"generator": self.generator.get_state()}
+        for each in (*self.sets, *self.groups, *self.parts.values()):
+            tensors.update(each.state())
+        return tensors
+
+    def load(self, state: dict[str, Tensor]) -> None:
+        """Go on from :meth:`state` of any stage."""
+        for part in self.parts.values():
+            part.restore(state)
+        self.generator.set_state(state["generator"])
+        for each in (*self.sets, *self.groups):
+            each.load(state)

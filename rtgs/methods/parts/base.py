@@ -1,0 +1,192 @@
+"""The base set: Gaussians from the scene's points, rasterised. Every method's first part."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import fields, replace
+from typing import TYPE_CHECKING, Protocol
+
+import torch
+from torch import Tensor
+
+from rtgs.core.decisions import Decision
+from rtgs.gaussians.initialize import gaussians_from_points
+from rtgs.gaussians.materials import MaterialSurfels, activate_materials
+from rtgs.gaussians.primitives import Gaussians
+from rtgs.gaussians.surfels import ActivatedSurfels
+from rtgs.methods.parts.gaussian_set import GaussianSet, densified, opacity_reset
+from rtgs.methods.parts.kinds import GaussianKind, RasterRequest
+from rtgs.methods.parts.part import Frame, Part, Raster, Rows
+from rtgs.methods.shading.diffuse import diffuse
+from rtgs.train.method import Observation, RenderedView, RenderOptions, StepEvent
+from rtgs.train.schedule import (
+    check_schedule,
+    densify_ahead,
+    densify_due,
+    opacity_reset_due,
+    opacity_was_reset,
+    sh_degree_at,
+)
+from rtgs.train.settings import DensitySettings, MaterialSettings, McmcSettings, ScheduleSettings
+
+if TYPE_CHECKING:
+    from rtgs.methods.model import Setup
+
+
+class BaseRules(Protocol):
+    """When the base set is held, densified and reset, where another part decides it."""
+
+    def held(self, step: int) -> tuple[str, ...]:
+        """Parameters that stand still in ``step``."""
+        ...
+
+    def densify_due(self, following: int) -> bool: ...
+
+    def reset_due(self, following: int) -> bool: ...
+
+    def after_reset(self) -> None:
+        """Opacities of the base set have just been lowered."""
+        ...
+
+
+class BaseSet(Part):
+    """A set of Gaussians of one kind from the scene's points (method.md 3.1), and its density control.
+
+    Attributes:
+        set: the Gaussians in training.
+        schedule: of density control; a later stage may end it early.
+        rules: of another part that decides about this set while it is in use; None: the schedule alone.
+    """
+
+    name = "base"
+
+    def __init__(self, setup: Setup, kind: GaussianKind) -> None:
+        check_schedule(setup.schedule)
+        settings, scene = setup.settings, setup.scene
+        self.kind = kind
+        self.settings = settings
+        self.generator = setup.generator
+        self.extent = scene.extent
+        self.run = setup.schedule
+        self.schedule = setup.schedule
+        self.rules: BaseRules | None = None
+        self.mcmc = mcmc_of(settings.density)
+        init = settings.init
+        if self.mcmc is not None:
+            init = replace(init, opacity=self.mcmc.init_opacity, scale=self.mcmc.init_scale)
+        self.set = GaussianSet(
+            self.name,
+            gaussians_from_points(kind.type, scene.points, scene.point_colors, init, setup.generator),
+            optimizer=settings.optimizer,
+            density=settings.density,
+            means_lr_steps=setup.schedule.means_lr_steps,
+            extent=scene.extent,
+        )
+        self._background = torch.tensor(settings.render.background)
+        self._decisions = _decide_density(self.mcmc, setup.schedule)
+
+    @property
+    def sets(self) -> tuple[GaussianSet, ...]:
+        return (self.set,)
+
+    @property
+    def decisions(self) -> tuple[Decision, ...]:
+        return self._decisions
+
+    def sh_degree(self, step: int) -> int:
+        """SH degree in use at ``step``."""
+        return sh_degree_at(self.run, step, self.set.gaussians.sh_degree)
+
+    # ---- rendering
+
+    def watched(self, frame: Frame) -> bool:
+        """Whether density control learns from this view: only while it will run again."""
+        return frame.training and self.set.density.needs_signal and densify_ahead(self.schedule, frame.step)
+
+    def rasterize(self, frame: Frame, wanted: RenderOptions, appended: Sequence[Rows] = ()) -> Raster:
+        """Rasterise the set: SH colours, then its channels, and the rows that other parts append.
+
+        Raises:
+            ValueError: a map is asked for that this kind of Gaussian does not have.
+        """
+        self.kind.refuse_lacking(wanted)
+        watched = self.watched(frame)
+        rows = self.set.activated(frame.camera.center.float(), self.sh_degree(frame.step))
+        probe = self.set.new_probe() if watched else None
+        features = composited(self.set.gaussians, rows.colors, self.settings.materials)
+        shape, features = _joined(Rows(rows, features), appended)
+        more = len(shape.means) - len(self.set)  # rows that density control does not watch
+        request = RasterRequest(
+            frame.camera,
+            wanted,
+            watched,
+            probe if probe is None or more == 0 else torch.nn.functional.pad(probe, (0, 0, 0, more)),
+            torch.nn.functional.pad(self._background, (0, features.shape[1] - 3)),
+            self.settings.render,
+            self.extent,
+        )
+        buffers = self.kind.rasterize(shape, features, request)
+        if probe is None or buffers.weight_sum is None:
+            return Raster(buffers)
+        return Raster(buffers, (Observation(self.name, probe, buffers.weight_sum[: len(self.set)]),))
+
+    def shade(self, frame: Frame, raster: Raster) -> RenderedView:
+        """The view as it is rasterised."""
+        return RenderedView(frame.camera, diffuse(raster.buffers), raster.buffers, observations=raster.observations)
+
+    # ---- between steps
+
+    def step(self, step: int, observations: Mapping[str, Observation]) -> None:
+        held = () if self.rules is None else self.rules.held(step)
+        self.set.step(step, self.sh_degree(step), observations.get(self.name), held=held)
+        self.set.perturb(step, self.generator)
+
+    def control(self, following: int) -> Iterator[StepEvent]:
+        """Density control and opacity resets as the schedule or the rules ask.
+
+        Raises:
+            RtgsError: density control left no Gaussian.
+        """
+        rules = self.rules
+        if densify_due(self.schedule, following) if rules is None else rules.densify_due(following):
+            reset = opacity_was_reset(self.run, following)
+            yield densified(self.set, self.settings.density, self.generator, following, after_reset=reset)
+        if not self.set.density.resets_opacity:
+            return
+        if opacity_reset_due(self.schedule, following) if rules is None else rules.reset_due(following):
+            yield opacity_reset(self.set, self.settings.density)
+            if rules is not None:
+                rules.after_reset()
+
+
+def mcmc_of(density: DensitySettings) -> McmcSettings | None:
+    """The settings of MCMC where it is the strategy."""
+    return density.mcmc if density.strategy == "mcmc" else None
+
+
+def composited(gaussians: Gaussians, colors: Tensor, settings: MaterialSettings) -> Tensor:
+    """(N, C) what is composited of a set: SH colours (N, 3), and with materials k_s, roughness, f0."""
+    if not isinstance(gaussians, MaterialSurfels):
+        return colors
+    materials = activate_materials(gaussians, settings)
+    return torch.cat((colors, materials.specular[:, None], materials.roughness[:, None], materials.f0), dim=1)
+
+
+def _joined(base: Rows, appended: Sequence[Rows]) -> tuple[ActivatedSurfels, Tensor]:
+    if not appended:
+        return base.shape, base.features
+    every = (base, *appended)
+    names = [field.name for field in fields(ActivatedSurfels)]
+    shape = ActivatedSurfels(**{name: torch.cat([getattr(rows.shape, name) for rows in every]) for name in names})
+    return shape, torch.cat([rows.features for rows in every])
+
+
+def _decide_density(mcmc: McmcSettings | None, schedule: ScheduleSettings) -> tuple[Decision, ...]:
+    """What density control does differently in this run."""
+    if mcmc is None:
+        return ()
+    start = f"opacity {mcmc.init_opacity:g} and {mcmc.init_scale:g} times the size"
+    decisions = [Decision(f"initial Gaussians of {start}", "density.strategy is mcmc (density.mcmc.init_*)")]
+    if schedule.opacity_reset_every:
+        decisions.append(Decision("no opacity resets", "density.strategy mcmc moves what is transparent instead"))
+    return tuple(decisions)

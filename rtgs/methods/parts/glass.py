@@ -1,0 +1,347 @@
+"""Transparent objects: the third stage of RT-GS, its sets, when it is left out, what a checkpoint holds of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from rtgs.core.cameras import Camera
+from rtgs.core.decisions import Decision
+from rtgs.core.errors import RtgsError
+from rtgs.gaussians.materials import MaterialSurfels
+from rtgs.gaussians.surfels import Surfels
+from rtgs.mesh.container import ObjectGuide, ObjectMesh, ObjectSurfaces
+from rtgs.mesh.silhouettes import bounding
+from rtgs.methods.parts.base import BaseSet, composited
+from rtgs.methods.parts.gaussian_set import GaussianSet, densified, opacity_reset
+from rtgs.methods.parts.glass_evidence import glass_faces, masked_views, on_surface, seen_bare
+from rtgs.methods.parts.interface_set import InterfaceSet, interface_surfels
+from rtgs.methods.parts.mirror import Mirror, stored_surfels
+from rtgs.methods.parts.part import Frame, Part, Rows
+from rtgs.methods.parts.straight_rays import StraightRays
+from rtgs.methods.parts.traced_set import FollowingTree, TracedSet
+from rtgs.methods.parts.transmittance_init import initial_box, random_surfels, rows_inside, take_out
+from rtgs.methods.shading.mirror import SurfacePixels
+from rtgs.methods.shading.straight import GlassPixels, GlassRays, Transmission, glass_pixels, glass_weights, widened
+from rtgs.train.method import Mode, Observation, RenderOptions, Stage, StepEvent
+from rtgs.train.schedule import (
+    densify_ahead,
+    densify_due,
+    loss_start,
+    opacity_reset_due,
+    opacity_was_reset,
+    sh_degree_at,
+    transmittance_plan,
+)
+
+if TYPE_CHECKING:
+    from rtgs.methods.model import Setup
+    from rtgs.scenes.scene import View
+
+_BEGUN = "third_stage"  # in the state: the stage has begun
+_GLASS = "glass_faces"
+_LEFT_OUT = "third_stage_left_out"  # instead of both
+NOT_MASKED = -1.0  # the stage is left out for want of masks
+
+
+class Glass(Part):
+    """A transmittance set and an interface on the object's mesh: image = ... + k_s w_t C_t in transparent objects.
+
+    C_t is what a straight ray meets first in the transmittance set and then, from the object's back surface on, in the
+    base set. Without an object mesh the part stays idle.
+
+    Attributes:
+        guide: of the object's mesh; None: without one.
+        transmittance, interface: the sets; None before the stage, and where settings leave them out.
+        begun: the stage has begun.
+    """
+
+    name = "glass"
+
+    def __init__(self, setup: Setup, base: BaseSet, mirror: Mirror, stage: str = "transmittance") -> None:
+        """``stage``: the one with which this part begins."""
+        settings = setup.settings
+        self.base, self.mirror = base, mirror
+        self.settings = settings
+        self.schedule = setup.schedule
+        self.generator = setup.generator
+        self.extent = setup.scene.extent
+        self.through = transmittance_plan(settings.transmittance, setup.schedule)
+        self.guide: ObjectGuide | None = None
+        self.transmittance: TracedSet | None = None
+        self.interface: InterfaceSet | None = None
+        self.begun = False
+        self._stage = stage
+        self._from_base = False  # the transmittance set was taken from the base set
+        self._glass = torch.zeros(0, dtype=torch.bool)  # (F,) faces of the mesh that are the object's surface
+        self._base_tree = FollowingTree(settings.transmittance.rebuild_every)
+        self._left_out: float | None = None  # why, where the stage was: as :meth:`_reason_against`
+        self._points = setup.scene.points
+        self._views = setup.scene.train
+        self._masked = any(bool(mask.any()) for _, mask in masked_views(setup.scene.train))
+        mirror.through = self
+        if setup.object_mesh is not None and settings.transmittance.enabled:
+            self.guide = ObjectGuide(setup.object_mesh)
+            frozen = self.through.start if settings.transmittance.freeze_base else None
+            mirror.replan(self.through.base, frozen)
+
+    @property
+    def sets(self) -> tuple[GaussianSet, ...]:
+        return tuple(each for each in (self.transmittance, self.interface) if each is not None)
+
+    @property
+    def decisions(self) -> tuple[Decision, ...]:
+        if self._left_out is None:
+            return ()
+        why = "the masks of the training views are empty, or cover all of them"
+        if self._left_out != NOT_MASKED:
+            share = f"{self._left_out:.1%} of its pixels"
+            why = f"the masked object looks opaque: in {share} the photos show its own surface "
+            why += "(method.transmittance.opaque_share)"
+        return (Decision("no transmittance stage", why),)
+
+    @property
+    def spared(self) -> str:
+        """A scene with masks is not matte: they show its transparent object."""
+        return "the scene has masks of a transparent object" if self._masked else ""
+
+    def mask(self, view: View) -> Tensor | None:
+        """L_spec acts in masks that bound something, unless the stage was left out."""
+        return bounding(view.mask) if self._left_out is None else None
+
+    # ---- the beginning
+
+    def begin(self, stage: Stage) -> Iterator[StepEvent]:
+        """Base surfels inside the object become the transmittance set, the interface is put on the mesh."""
+        if stage.name != self._stage:
+            return
+        if self.guide is None:
+            raise RtgsError("the transmittance stage needs the transparent object's mesh: run extract_mesh before it")
+        if (share := self._reason_against(stage.from_step)) is not None:
+            self._leave_out(share)
+            yield StepEvent("decision", "transmittance", f"left out: {self.decisions[-1].why}")
+            return
+        yield from self.mirror.add()
+        self.begun = True
+        mesh, settings = self.guide.mesh, self.settings.transmittance
+        self._glass = glass_faces(self.guide, self._views, settings.interface.masked_share)
+        kept = self._seen_bare(stage.from_step)  # before the interface hides what is in the object
+        if settings.interface.count > 0:
+            yield self._add_interface(mesh)
+        if settings.first_bounce == "transmittance":
+            yield self._add_transmittance(mesh, kept)
+
+    def _add_interface(self, mesh: ObjectMesh) -> StepEvent:
+        gaussians = self.base.set.gaussians
+        assert isinstance(gaussians, Surfels)
+        made = interface_surfels(self.settings, mesh, self._glass, gaussians, self.generator)
+        self.interface = self._interface_set(made)
+        detail = f"{len(made)} surfels on the {mesh.source} mesh"
+        if opaque := int((~self._glass).sum()):
+            detail += f", none on {opaque} of its {len(self._glass)} faces: they are not masked where they are seen"
+        return StepEvent("begin", "interface", detail)
+
+    def _reason_against(self, step: int) -> float | None:
+        """``NOT_MASKED``, or the share of masked pixels that look opaque, where the stage is left out; else None."""
+        if not self._masked:
+            return NOT_MASKED
+        border = self.settings.transmittance.opaque_share
+        assert self.guide is not None
+        if border >= 1 or self.guide.mesh.source == "tsdf":  # that mesh is what the photos show, whatever it is
+            return None
+        share = on_surface(self.guide, self._views, lambda camera: self._opaque(camera, step))
+        return share if share is not None and share > border else None
+
+    def _leave_out(self, share: float) -> None:
+        """Go on as in the second stage, as a run that ends with it."""
+        self._left_out = share
+        self.mirror.replan(self.schedule)
+
+    def _seen_bare(self, step: int) -> Tensor:
+        """(N,) bool: base surfels that enough training views show with nothing transparent before them."""
+        settings = self.settings.transmittance
+        if settings.keep_seen == 0 or not settings.split:
+            return torch.zeros(len(self.base.set), dtype=torch.bool)
+        means = self.base.set.gaussians.means.detach()
+        counts = seen_bare(means, self._views, lambda camera: self._opaque(camera, step))
+        return counts >= settings.keep_seen
+
+    @torch.no_grad()
+    def _opaque(self, camera: Camera, step: int) -> Tensor:
+        """(H, W) median depth of the base set."""
+        wanted = RenderOptions(median_depth=True)
+        found = self.base.rasterize(Frame(camera, step, Mode.EVALUATE, wanted), wanted).buffers.median_depth
+        assert found is not None
+        return found
+
+    def _add_transmittance(self, mesh: ObjectMesh, kept: Tensor) -> StepEvent:
+        settings, cameras = self.settings.transmittance, [view.camera for view in self._views]
+        base = self.base.set
+        where = "behind the pane" if mesh.flat else "inside the object"
+        inside = torch.zeros(len(base), dtype=torch.bool)
+        if settings.split:
+            assert isinstance(base.gaussians, Surfels)
+            inside = rows_inside(base.gaussians, mesh, settings.split_margin * mesh.voxel, cameras)
+        found = int(inside.sum())
+        some_stay = mesh.flat or found < len(inside)
+        if settings.init.min_points <= found and some_stay:
+            kept = torch.ones_like(kept) if mesh.flat else kept  # what is behind a pane is seen beside it, too
+            surfels, detail = take_out(base, inside, kept), f"{found} base surfels {where}"
+            if mesh.flat:
+                detail = f"copies of {detail}"
+            elif both := int((inside & kept).sum()):
+                detail += f", {both} of them seen bare too: they also stay in the base set"
+            self._from_base = True
+            self._base_tree.clear()
+        else:
+            box = initial_box(settings, mesh, cameras, self._points)
+            surfels = random_surfels(settings, box, self.generator)
+            many = f"only {found}" if some_stay else f"all {found}"
+            why = f", for {many} base surfels are {where}" if settings.split else ""
+            detail = f"{len(surfels)} random surfels in the box of the {settings.box}{why}"
+        self.transmittance = self._transmittance_set(surfels)
+        return StepEvent("begin", "transmittance", detail)
+
+    def _transmittance_set(self, surfels: Surfels) -> TracedSet:
+        settings = self.settings.transmittance
+        return TracedSet(
+            "transmittance",
+            surfels,
+            optimizer=self.settings.optimizer.learning_faster(settings.rate_gain),
+            density=settings.density,
+            means_lr_steps=self.through.own.means_lr_steps,
+            extent=self.extent,
+            rebuild_every=settings.rebuild_every,
+        )
+
+    def _interface_set(self, surfels: MaterialSurfels) -> InterfaceSet:
+        made = InterfaceSet(
+            "interface",
+            surfels,
+            optimizer=self.settings.optimizer,
+            density=self.settings.density,
+            means_lr_steps=self.schedule.means_lr_steps,
+            extent=self.extent,
+        )
+        return made.put(self.settings.transmittance.interface.floor)
+
+    # ---- rendering
+
+    def appended(self, frame: Frame) -> Rows | None:
+        """The interface: it is rasterised with the base set, as its surface in the object's pixels."""
+        if self.interface is None:
+            return None
+        shape = self.interface.activated(frame.camera.center.float(), self.base.sh_degree(frame.step))
+        return Rows(shape, composited(self.interface.gaussians, shape.colors, self.settings.materials))
+
+    def pixels(self, frame: Frame, flat: SurfacePixels) -> GlassPixels | None:
+        """The pixels of the view's mask in training, of the silhouette or of given masks else."""
+        settings = self.settings.transmittance
+        if not self.begun or settings.first_bounce == "none":
+            return None
+        assert self.guide is not None
+        surfaces, mask = self.guide.surfaces(frame.camera), bounding(frame.mask)
+        source = "given" if frame.training else frame.options.masks or settings.test_masks
+        if source == "silhouette" or mask is None:  # a view without a mask shows the object all the same
+            inside = surfaces.hit
+        elif frame.training:
+            inside = mask
+        else:
+            inside = mask & surfaces.hit  # method.md 6.3: where the ray misses the mesh nothing is transmitted
+        inside = widened(inside, settings.rim if settings.interface.count > 0 else 0)
+        glass = self.on_glass(surfaces)
+        return glass_pixels(flat, surfaces, inside, glass, first_surface=settings.first_surface, normal=settings.normal)
+
+    def on_glass(self, surfaces: ObjectSurfaces) -> Tensor:
+        """(H, W) bool: the mesh's first surface is one of the object's, not a lid or a label."""
+        return surfaces.hit & self._glass[surfaces.triangle.clamp_min(0).long()]
+
+    def weights(
+        self, reflection: Tensor, cosine: Tensor, pixels: SurfacePixels, inside: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """w_r and w_t of the traced pixels, with the S_max and the bound of the object's pixels."""
+        settings, optics = self.settings.transmittance, self.settings.optics
+        optics = optics if settings.max_gain is None else replace(optics, max_gain=settings.max_gain)
+        bounded = settings.max_weight > 0 and settings.interface.count > 0
+        return glass_weights(reflection, cosine, pixels, inside, optics, settings.max_weight if bounded else 0.0)
+
+    def transmit(self, frame: Frame, glass: GlassPixels, rays: GlassRays) -> Transmission:
+        """C_t of the traced pixels."""
+        assert self.guide is not None
+        own = self.transmittance
+        straight = StraightRays(
+            self.settings,
+            self.guide.mesh,
+            self.base,
+            self._base_tree,
+            own,
+            0 if own is None else self._own_degree(frame.step),
+            frame.training and self._depth_loss_on(frame.step),
+            frame.training and own is not None and self._watching(own, frame.step),
+        )
+        return straight.transmit(frame, rays)
+
+    def _own_degree(self, step: int) -> int:
+        """SH degree of the transmittance set: grown on its own clock, but never below what it came with."""
+        assert self.transmittance is not None
+        largest = min(self.transmittance.gaussians.sh_degree, self.settings.transmittance.sh_degree)
+        if self._from_base:
+            return min(self.base.sh_degree(step), largest)
+        return sh_degree_at(self.through.own, self.through.clock(step), largest)
+
+    def _watching(self, own: TracedSet, step: int) -> bool:
+        return own.density.needs_signal and densify_ahead(self.through.own, self.through.clock(step))
+
+    def _depth_loss_on(self, step: int) -> bool:
+        loss = self.settings.loss
+        on = loss.transmission_depth > 0 and step >= loss_start(loss.transmission_depth_start, self.schedule.total)
+        return on and self.transmittance is not None and self.settings.transmittance.first_bounce_end == "open"
+
+    # ---- between steps
+
+    def step(self, step: int, observations: Mapping[str, Observation]) -> None:
+        """Adam on the sets of this stage; the transmittance set on its own clock."""
+        self._base_tree.moved()
+        if self.interface is not None:
+            self.interface.step(step, self.base.sh_degree(step))
+        if self.transmittance is not None:
+            clock = self.through.clock(step)
+            self.transmittance.step(clock, self._own_degree(step), observations.get(self.transmittance.name))
+
+    def control(self, following: int) -> Iterator[StepEvent]:
+        """Density control of the transmittance set on its own clock."""
+        if self.transmittance is None:
+            return
+        settings, own = self.settings.transmittance.density, self.through.own
+        clock = self.through.clock(following)
+        self.transmittance.perturb(clock - 1, self.generator)
+        if densify_due(own, clock):
+            reset = opacity_was_reset(self.schedule, following)
+            yield densified(self.transmittance, settings, self.generator, following, after_reset=reset)
+        if self.transmittance.density.resets_opacity and opacity_reset_due(own, clock):
+            yield opacity_reset(self.transmittance, settings)
+
+    # ---- state
+
+    def state(self) -> dict[str, Tensor]:
+        if self._left_out is not None:
+            return {_LEFT_OUT: torch.tensor([self._left_out])}
+        if not self.begun:
+            return {}
+        return {_BEGUN: torch.tensor([self._from_base], dtype=torch.uint8), _GLASS: self._glass.to(torch.uint8)}
+
+    def restore(self, state: Mapping[str, Tensor]) -> None:
+        """The stage as far as the state has it."""
+        self.begun = _BEGUN in state
+        self._from_base = self.begun and bool(state[_BEGUN])
+        self._glass = state[_GLASS].bool() if self.begun else self._glass
+        if _LEFT_OUT in state and self._left_out is None:
+            self._leave_out(float(state[_LEFT_OUT]))
+        own, interface = stored_surfels(state, "transmittance"), stored_surfels(state, "interface", MaterialSurfels)
+        self.transmittance = None if own is None else self._transmittance_set(own)
+        self.interface = None if interface is None else self._interface_set(interface)  # type: ignore[arg-type]
+        self._base_tree.clear()

@@ -1,0 +1,108 @@
+"""The kinds of Gaussians a base set can be made of: which parameters, which maps, which rasteriser."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from rtgs.core.cameras import Camera
+from rtgs.gaussians.ellipsoids import Ellipsoids
+from rtgs.gaussians.primitives import Gaussians
+from rtgs.gaussians.surfels import ActivatedSurfels, Surfels
+from rtgs.render.buffers import EllipsoidOptions, RasterBuffers, RasterOptions
+from rtgs.render.ellipsoids import rasterize_ellipsoids
+from rtgs.render.surfels import rasterize_surfels
+from rtgs.train.method import RenderOptions
+from rtgs.train.settings import RenderSettings
+
+
+@dataclass(frozen=True)
+class RasterRequest:
+    """What a base set asks of its rasteriser for one view."""
+
+    camera: Camera
+    wanted: RenderOptions
+    weight_sum: bool  # summed weights of every Gaussian, for density control
+    probe: Tensor | None  # (N, 2) whose gradient is the densification signal
+    background: Tensor  # (C,) of the features
+    settings: RenderSettings
+    extent: float  # of the scene, world units: near and far are shares of it
+
+
+Rasterize = Callable[[ActivatedSurfels, Tensor, RasterRequest], RasterBuffers]
+
+
+@dataclass(frozen=True)
+class GaussianKind:
+    """A kind of Gaussian as a base set uses it."""
+
+    type: type[Gaussians]
+    maps: tuple[str, ...]  # of RenderOptions, those that its rasteriser gives
+    rasterize: Rasterize  # activated rows and their features (N, C) to maps
+
+    def refuse_lacking(self, wanted: RenderOptions) -> None:
+        """Raises ValueError where a map is asked for that this kind does not have."""
+        names = ("depth", "median_depth", "normal", "distortion")
+        if lacking := [name for name in names if getattr(wanted, name) and name not in self.maps]:
+            raise ValueError(
+                f"{self.type.__name__} render no {', '.join(lacking)}: their maps are {', '.join(self.maps)}"
+            )
+
+
+def surfel_options(
+    wanted: RenderOptions, settings: RenderSettings, extent: float, *, weight_sum: bool
+) -> RasterOptions:
+    """The surfel rasteriser's options: near and far in world units of a scene of this ``extent``."""
+    return RasterOptions(
+        near=settings.near * extent,
+        far=settings.far * extent,
+        depth=wanted.depth,
+        median_depth=wanted.median_depth,
+        normal=wanted.normal,
+        distortion=wanted.distortion,
+        weight_sum=weight_sum,
+    )
+
+
+def _surfels(rows: ActivatedSurfels, features: Tensor, request: RasterRequest) -> RasterBuffers:
+    return rasterize_surfels(
+        rows.means,
+        rows.tangent_u,
+        rows.tangent_v,
+        rows.scales,
+        rows.opacities,
+        features,
+        request.camera,
+        background=request.background,
+        options=surfel_options(request.wanted, request.settings, request.extent, weight_sum=request.weight_sum),
+        screen_probe=request.probe,
+    )
+
+
+def _ellipsoids(rows: ActivatedSurfels, features: Tensor, request: RasterRequest) -> RasterBuffers:
+    settings = request.settings
+    buffers = rasterize_ellipsoids(
+        rows.means,
+        rows.tangent_u,
+        rows.tangent_v,
+        rows.scales,
+        rows.opacities,
+        features,
+        request.camera,
+        background=request.background,
+        options=EllipsoidOptions(
+            near=settings.near * request.extent,
+            dilation=settings.dilation,
+            antialiased=settings.antialiased,
+            depth=request.wanted.depth,
+            weight_sum=request.weight_sum,
+        ),
+        screen_probe=request.probe,
+    )
+    return RasterBuffers(buffers.features, buffers.alpha, buffers.depth, weight_sum=buffers.weight_sum)
+
+
+SURFELS = GaussianKind(Surfels, ("depth", "median_depth", "normal", "distortion"), _surfels)
+ELLIPSOIDS = GaussianKind(Ellipsoids, ("depth",), _ellipsoids)

@@ -1,0 +1,383 @@
+"""The reflection set: one mirror ray per pixel, traced through a set of its own (method.md 3.3, 6.1, 6.2).
+
+image = (1 - k_s) C_d + k_s w_r C_r, and inside transparent objects + k_s w_t C_t of a part that sees through them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Protocol
+
+import torch
+from torch import Tensor
+
+from rtgs.core.decisions import Decision
+from rtgs.gaussians.materials import MaterialSurfels, with_materials, without_materials
+from rtgs.gaussians.surfels import Surfels
+from rtgs.methods.parts.base import BaseSet
+from rtgs.methods.parts.gaussian_set import GaussianSet, densified, opacity_reset
+from rtgs.methods.parts.matte import MatteEvidence, gather_evidence
+from rtgs.methods.parts.part import Frame, Part, Raster
+from rtgs.methods.parts.propagation import propagate_normals, reset_specular
+from rtgs.methods.parts.reflection_init import reflection_surfels, scene_color
+from rtgs.methods.parts.traced_set import TracedSet
+from rtgs.methods.shading.mirror import (
+    MirrorRays,
+    SurfacePixels,
+    mirror_rays,
+    reflected_weight,
+    showing_reflection,
+    specular_change,
+    surface_pixels,
+    surface_there,
+)
+from rtgs.methods.shading.pixel_maps import add_transmission, full_view, specular_layers, take_pixels
+from rtgs.methods.shading.straight import GlassPixels, GlassRays, Transmission, glass_rays
+from rtgs.methods.shading.traced_pixels import TracedPixels, choose_pixels
+from rtgs.optics.light import decoded, encoded
+from rtgs.render.buffers import RasterBuffers, TraceOptions
+from rtgs.train.losses import surface_depth
+from rtgs.train.method import Mode, Observation, RenderedView, RenderOptions, Stage, StepEvent
+from rtgs.train.schedule import (
+    base_densify_due,
+    base_reset_due,
+    densify_ahead,
+    densify_due,
+    opacities_held,
+    opacity_was_reset,
+    propagation_due,
+    reflection_plan,
+    reflection_reset_due,
+    sh_degree_at,
+)
+from rtgs.train.settings import ScheduleSettings
+
+if TYPE_CHECKING:
+    from rtgs.methods.model import Setup
+    from rtgs.scenes.scene import View
+
+
+class SeeThrough(Protocol):
+    """What the mirror's shading asks of a part for transparent objects."""
+
+    @property
+    def spared(self) -> str:
+        """Why the scene is not judged matte; empty: it is judged."""
+        ...
+
+    def pixels(self, frame: Frame, flat: SurfacePixels) -> GlassPixels | None:
+        """Where this view looks through a transparent object; None: nowhere, or not yet."""
+        ...
+
+    def weights(
+        self, reflection: Tensor, cosine: Tensor, pixels: SurfacePixels, inside: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """w_r and w_t of the traced pixels, from w_r outside the object; ``inside`` (P,) bool."""
+        ...
+
+    def transmit(self, frame: Frame, glass: GlassPixels, rays: GlassRays) -> Transmission:
+        """What straight rays through the object meet."""
+        ...
+
+
+@dataclass(frozen=True)
+class Reflected:
+    """What the mirror rays of P traced pixels met."""
+
+    pixels: SurfacePixels  # where they start
+    rays: MirrorRays
+    color: Tensor  # (3, P) C_r
+    observations: tuple[Observation, ...]
+
+
+class Mirror(Part):
+    """The reflection set, materials on the base set, and the shading that joins them.
+
+    They are there exactly while reflection is in use: a scene found matte loses them again and goes on as in the stage
+    before.
+
+    Attributes:
+        set: the reflection set; None before the stage and in a matte scene.
+        plan: when the stage does what.
+        through: of a part for transparent objects; None: there is none.
+    """
+
+    name = "mirror"
+
+    def __init__(self, setup: Setup, base: BaseSet, stage: str = "reflection") -> None:
+        """``stage``: the one with which this part begins."""
+        self.base = base
+        self.settings = setup.settings
+        self.schedule = setup.schedule
+        self.generator = setup.generator
+        self.extent = setup.scene.extent
+        self.set: TracedSet | None = None
+        self.through: SeeThrough | None = None
+        self.plan = reflection_plan(setup.settings.reflection, base.schedule)
+        self._stage = stage
+        self._matte: MatteEvidence | None = None
+        self._points = setup.scene.points
+        self._views = setup.scene.train
+        self._sky = scene_color(setup.settings.reflection.background, (view.image for view in setup.scene.train))
+
+    @property
+    def sets(self) -> tuple[GaussianSet, ...]:
+        return () if self.set is None else (self.set,)
+
+    @property
+    def decisions(self) -> tuple[Decision, ...]:
+        if self._matte is None:
+            return ()
+        return (Decision("the reflection stage ended early", f"nothing specular in this scene: {self._matte}"),)
+
+    def replan(self, schedule: ScheduleSettings, propagation_until: int | None = None) -> None:
+        """Another schedule of the base set's density control; normals are propagated no later than said."""
+        self.base.schedule = schedule
+        self.plan = reflection_plan(self.settings.reflection, schedule)
+        if propagation_until is not None:
+            self.plan = replace(self.plan, propagation_until=min(self.plan.propagation_until, propagation_until))
+
+    # ---- the beginning
+
+    def begin(self, stage: Stage) -> Iterator[StepEvent]:
+        """Materials on the base set, the reflection set in its box."""
+        if stage.name == self._stage:
+            yield from self.add()
+
+    def add(self) -> Iterator[StepEvent]:
+        """Begin, if that has not happened yet."""
+        if self.set is not None:
+            return
+        self.base.set.adopt(with_materials(self.base.set.gaussians, self.settings.materials))  # type: ignore[arg-type]
+        settings = self.settings.reflection
+        color = scene_color(settings.init_color, (view.image for view in self._views))
+        self._adopt(reflection_surfels(settings, self._points, self.extent, self.generator, color))
+        assert self.set is not None
+        yield StepEvent("begin", "reflection", f"{len(self.set)} surfels in the box")
+
+    def _adopt(self, surfels: Surfels | None) -> None:
+        """Have these raw surfels as the reflection set; None: have none."""
+        self.set, self.base.rules = None, None
+        if surfels is None:
+            return
+        settings = self.settings.reflection
+        self.base.rules = self
+        self.set = TracedSet(
+            "reflection",
+            surfels,
+            optimizer=self.settings.optimizer.learning_faster(settings.rate_gain),
+            density=settings.density,
+            means_lr_steps=self.schedule.means_lr_steps,
+            extent=self.extent,
+            rebuild_every=settings.rebuild_every,
+        )
+
+    # ---- rendering
+
+    def needs(self, frame: Frame) -> RenderOptions:
+        if self.set is None:
+            return RenderOptions()
+        ratio = self.settings.render.depth_ratio
+        return RenderOptions(depth=ratio < 1, median_depth=ratio > 0, normal=True)
+
+    def shade(self, frame: Frame, raster: Raster) -> RenderedView | None:
+        """Join the layers; in training only some pixels may be traced, and the image of the others is C_d."""
+        if self.set is None:
+            return None
+        camera, buffers, blend = frame.camera, raster.buffers, self.settings.optics.blend
+        flat = self._flat_pixels(buffers)
+        glass = None if self.through is None else self.through.pixels(frame, flat)
+        flat = flat if glass is None else glass.flat
+        rays = camera.rays()
+        view = rays.directions.reshape(-1, 3).T
+        chosen = self._choose(frame, flat, buffers, view, glass)
+        met = self._reflect(frame, chosen, flat, rays.origin, view)
+        reflection, transmission = self._weights(met, None if glass is None else glass.inside[chosen.index])
+        light, passed = reflection * decoded(met.color, blend), None
+        if glass is not None:
+            assert self.through is not None
+            passed = self.through.transmit(frame, glass, glass_rays(glass, chosen.index, rays.origin, view))
+            light = light + transmission * decoded(passed.color, blend)
+        change = specular_change(met.pixels, light, chosen.emphasis, blend)
+        shape = (3, camera.height, camera.width)
+        layers = None
+        if frame.options.layers:
+            reflected = encoded(met.pixels.specular * reflection * decoded(met.color, blend), blend)
+            layers = specular_layers(flat, chosen, reflected, met.color, shape)
+            if passed is not None:
+                through = encoded(met.pixels.specular * transmission * decoded(passed.color, blend), blend)
+                layers = add_transmission(layers, chosen, through, passed.color, shape)
+        return RenderedView(
+            camera,
+            full_view(flat.diffuse, chosen, change, shape),
+            buffers,
+            layers,
+            flat.specular.reshape(shape[1:]),
+            None if passed is None else passed.first_bounce,
+            None if glass is None else glass.inside.reshape(shape[1:]),
+            (*raster.observations, *met.observations, *(() if passed is None else passed.observations)),
+        )
+
+    def _flat_pixels(self, buffers: RasterBuffers) -> SurfacePixels:
+        """Every pixel of the view, flattened."""
+        depth = buffers.alpha if buffers.depth is None else buffers.depth  # unused at ratio 1
+        surface = surface_depth(depth, buffers.alpha, buffers.median_depth, self.settings.render.depth_ratio)
+        assert buffers.normal is not None
+        return surface_pixels(
+            buffers.features.flatten(1),
+            buffers.alpha.flatten(),
+            surface.flatten(),
+            buffers.normal.flatten(1),
+            self.settings.materials,
+        )
+
+    @torch.no_grad()
+    def _choose(
+        self, frame: Frame, flat: SurfacePixels, buffers: RasterBuffers, view: Tensor, glass: GlassPixels | None
+    ) -> TracedPixels:
+        """Which pixels are traced, and which of them share a ray."""
+        settings, traced = self.settings.reflection, self.settings.reflection.traced
+        if not frame.training or frame.step < self.plan.judged:  # k_s has to tell the mirrors from the rest first
+            traced = replace(traced, shared_below=0.0)
+        there = surface_there(flat, buffers.alpha.flatten(), settings.smallest_alpha)
+        showing = None
+        if traced.threshold > 0 or traced.shared_below > 0:
+            showing = showing_reflection(flat, view, self.settings.optics)
+            showing = showing if glass is None else showing.masked_fill(glass.inside, torch.inf)
+            showing = showing.reshape(buffers.alpha.shape)
+        generator = self.generator if frame.training else None
+        return choose_pixels(there.reshape(buffers.alpha.shape), showing, traced, generator)
+
+    def _reflect(
+        self, frame: Frame, chosen: TracedPixels, flat: SurfacePixels, center: Tensor, view: Tensor
+    ) -> Reflected:
+        assert self.set is not None
+        pixels = take_pixels(flat, chosen.index)
+        rays = mirror_rays(pixels, center, view.index_select(1, chosen.index), self.settings.reflection.sh_direction)
+        ahead = self.set.density.needs_signal and densify_ahead(self.plan.reflection, frame.step)
+        watched = frame.training and ahead
+        origins, directions = rays.origins, rays.directions
+        if chosen.shared is not None:
+            origins, directions = (rows.index_select(0, chosen.shared.own) for rows in (origins, directions))
+        options = self.trace_options(frame.step, watched)
+        traced, observations = self.set.trace(origins, directions, options, watched=watched)
+        assert traced.colors is not None
+        colors = traced.colors if self._sky is None else traced.colors + (1 - traced.alpha)[:, None] * self._sky
+        color = (colors if chosen.shared is None else colors.index_select(0, chosen.shared.ray)).T
+        return Reflected(pixels, rays, color, observations)
+
+    def _weights(self, met: Reflected, inside: Tensor | None) -> tuple[Tensor, Tensor]:
+        """w_r and w_t (0 outside transparent objects); ``inside`` (P,) bool: the pixel shows one, None: none does."""
+        reflection = reflected_weight(met.rays.cosine, met.pixels, self.settings.optics)
+        if inside is None:
+            return reflection, torch.zeros(())
+        assert self.through is not None
+        return self.through.weights(reflection, met.rays.cosine, met.pixels, inside)
+
+    def trace_options(self, step: int, watched: bool) -> TraceOptions:
+        """How mirror rays are traced at ``step``; ``watched``: with the sums that density control needs."""
+        settings = self.settings.reflection
+        return TraceOptions(
+            t_min=settings.offset * self.extent,
+            transmittance_cutoff=settings.transmittance_cutoff,
+            alpha_cutoff=settings.alpha_cutoff,
+            sh_degree=self._degree(step),
+            weight_sum=watched,
+            direction_gradient=settings.direction_gradient,  # type: ignore[arg-type]
+            sh_direction=settings.sh_direction,  # type: ignore[arg-type]
+        )
+
+    def _degree(self, step: int) -> int:
+        assert self.set is not None
+        return sh_degree_at(self.plan.reflection, step, self.set.gaussians.sh_degree)
+
+    # ---- what it decides about the base set
+
+    def held(self, step: int) -> tuple[str, ...]:
+        """Opacities of the base set stand still for a while after a propagation of normals."""
+        return ("opacity_logits",) if opacities_held(self.plan, self.settings.reflection, step) else ()
+
+    def densify_due(self, following: int) -> bool:
+        return base_densify_due(self.plan, self.settings.reflection, following)
+
+    def reset_due(self, following: int) -> bool:
+        return base_reset_due(self.plan, following)
+
+    def after_reset(self) -> None:
+        if self.set is not None and self.settings.reflection.specular_reset:
+            reset_specular(self.base.set, self.settings.materials.specular)
+
+    # ---- between steps
+
+    def step(self, step: int, observations: Mapping[str, Observation]) -> None:
+        if self.set is not None:
+            self.set.step(step, self._degree(step), observations.get(self.set.name))
+            self.set.perturb(step, self.generator)
+
+    def judge(self, following: int) -> Iterator[StepEvent]:
+        """Look at some training views; a scene with nothing specular goes on without this part."""
+        if self.set is None or not self.plan.start < following == self.plan.judged < self.schedule.total:
+            return
+        if self.through is not None and self.through.spared:
+            yield StepEvent("decision", "reflection", f"goes on: {self.through.spared}")
+            return
+        evidence = self._evidence(following)
+        if not evidence.is_matte(self.settings.reflection.matte):
+            yield StepEvent("decision", "reflection", f"goes on: {evidence}")
+            return
+        self.set = None
+        self.base.set.adopt(without_materials(self.base.set.gaussians))  # type: ignore[arg-type]
+        self._matte = evidence
+        decision = self.decisions[-1]
+        yield StepEvent("decision", "reflection", f"{decision.what}: {decision.why}")
+
+    @torch.no_grad()
+    def _evidence(self, following: int) -> MatteEvidence:
+        settings = self.settings.reflection.matte
+        count = min(settings.views, len(self._views))
+        chosen = [self._views[round(k * (len(self._views) - 1) / max(count - 1, 1))] for k in range(count)]
+        return gather_evidence(((self._look(view, following), view) for view in chosen), settings.specular)
+
+    def _look(self, view: View, step: int) -> RenderedView:
+        frame = Frame(view.camera, step, Mode.EVALUATE, RenderOptions(layers=True))
+        raster = self.base.rasterize(frame, frame.options.plus(self.needs(frame)))
+        shaded = self.shade(frame, raster)
+        assert shaded is not None
+        return shaded
+
+    def control(self, following: int) -> Iterator[StepEvent]:
+        """Density control and resets of the reflection set, propagation of the base set's normals."""
+        if self.set is None:
+            self.base.rules = None  # judged matte in this step, or not begun
+            return
+        settings = self.settings.reflection
+        if densify_due(self.plan.reflection, following):
+            reset = opacity_was_reset(self.schedule, following)
+            yield densified(self.set, settings.density, self.generator, following, after_reset=reset)
+        if self.set.density.resets_opacity and reflection_reset_due(self.plan, following):
+            yield opacity_reset(self.set, settings.density)
+        if propagation_due(self.plan, settings, following):
+            yield propagate_normals(self.base.set, settings.propagation, self.generator)
+
+    # ---- state
+
+    def state(self) -> dict[str, Tensor]:
+        return {} if self._matte is None else {"matte": self._matte.tensor()}
+
+    def restore(self, state: Mapping[str, Tensor]) -> None:
+        """Materials and the reflection set as the state has them."""
+        gaussians, specular = self.base.set.gaussians, "base.surfels.specular_logits" in state
+        if specular != isinstance(gaussians, MaterialSurfels):
+            plain = without_materials(gaussians)  # type: ignore[arg-type]
+            self.base.set.adopt(with_materials(plain, self.settings.materials) if specular else plain)
+        self._adopt(stored_surfels(state, "reflection"))
+        if "matte" in state:
+            self._matte = MatteEvidence.of(state["matte"])
+
+
+def stored_surfels(state: Mapping[str, Tensor], name: str, kind: type[Surfels] = Surfels) -> Surfels | None:
+    """The raw surfels of a set in a state; None: it is not there."""
+    names = [field.name for field in fields(kind)]
+    found = {key: state[f"{name}.surfels.{key}"] for key in names if f"{name}.surfels.{key}" in state}
+    return kind(**{key: found[key].clone() for key in names}) if found else None

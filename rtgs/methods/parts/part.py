@@ -1,0 +1,106 @@
+"""What a model is composed of, and what its parts hand each other for one view."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from rtgs.core.cameras import Camera
+from rtgs.core.decisions import Decision
+from rtgs.gaussians.surfels import ActivatedSurfels
+from rtgs.render.buffers import RasterBuffers
+from rtgs.train.method import Mode, Observation, RenderedView, RenderOptions, Stage, StepEvent
+
+if TYPE_CHECKING:
+    from rtgs.methods.parts.gaussian_set import GaussianSet
+    from rtgs.train.parameters import ParameterGroup
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One view that is being rendered."""
+
+    camera: Camera
+    step: int
+    mode: Mode
+    options: RenderOptions
+    mask: Tensor | None = None  # (H, W) bool, the view's own of its transparent objects
+
+    @property
+    def training(self) -> bool:
+        """The view is rendered for a loss."""
+        return self.mode is Mode.TRAIN
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Gaussians to rasterise with the base set: M activated ones and what is composited of them."""
+
+    shape: ActivatedSurfels
+    features: Tensor  # (M, C), C as the base set's
+
+
+@dataclass(frozen=True)
+class Raster:
+    """The rasterised base set."""
+
+    buffers: RasterBuffers
+    observations: tuple[Observation, ...] = ()
+
+
+class Part:
+    """A part of a model: its hooks, with nothing in them. A part overrides those in which it has something to do."""
+
+    name: str
+
+    @property
+    def sets(self) -> tuple[GaussianSet, ...]:
+        """Sets of Gaussians of this part that train at present."""
+        return ()
+
+    @property
+    def groups(self) -> tuple[ParameterGroup, ...]:
+        """Groups of tensors of this part that train at present."""
+        return ()
+
+    @property
+    def decisions(self) -> tuple[Decision, ...]:
+        """What this part does without or differently, as far as it is known by now."""
+        return ()
+
+    def begin(self, stage: Stage) -> Iterable[StepEvent]:
+        """A stage starts afresh."""
+        return ()
+
+    def needs(self, frame: Frame) -> RenderOptions:
+        """Maps of the base set that :meth:`shade` reads."""
+        return RenderOptions()
+
+    def appended(self, frame: Frame) -> Rows | None:
+        """What is rasterised with the base set."""
+        return None
+
+    def shade(self, frame: Frame, raster: Raster) -> RenderedView | None:
+        """The view from the base set's maps; None: this part leaves it to those before it."""
+        return None
+
+    def step(self, step: int, observations: Mapping[str, Observation]) -> None:
+        """Adam after the backward pass; ``observations`` of the view by the name of the set."""
+
+    def judge(self, following: int) -> Iterable[StepEvent]:
+        """Whether the part goes on, before anything changes ahead of step ``following``."""
+        return ()
+
+    def control(self, following: int) -> Iterable[StepEvent]:
+        """Density control and resets before step ``following``."""
+        return ()
+
+    def state(self) -> dict[str, Tensor]:
+        """Tensors beside those of :attr:`sets` and :attr:`groups`."""
+        return {}
+
+    def restore(self, state: Mapping[str, Tensor]) -> None:
+        """Take over :meth:`state`, and have the sets and groups that the state holds: their tensors follow."""

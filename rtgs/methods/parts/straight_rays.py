@@ -1,0 +1,115 @@
+"""Straight rays through transparent objects: first what is inside, then what is behind (method.md 3.3, 4.4, 6.2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from rtgs.gaussians.surfels import Surfels
+from rtgs.mesh.container import ObjectMesh
+from rtgs.methods.parts.base import BaseSet
+from rtgs.methods.parts.part import Frame
+from rtgs.methods.parts.traced_set import FollowingTree, TracedSet, trace_set
+from rtgs.methods.shading.straight import GlassRays, Transmission
+from rtgs.render.buffers import TraceBuffers, TraceOptions
+from rtgs.train.method import FirstBounce, Observation
+from rtgs.train.settings import MethodSettings
+
+
+@dataclass(frozen=True)
+class StraightRays:
+    """The rays of one view through a transparent object, and what they are traced with.
+
+    Attributes:
+        own: the transmittance set, ``own_degree`` of its SH in use; None: rays meet the base set inside the object.
+        base_tree: of the base set as it is traced; the interface is not in it.
+        measured: the loss on the first bounce's depth is on.
+        watched: density control of the transmittance set learns from this view.
+    """
+
+    settings: MethodSettings
+    mesh: ObjectMesh
+    base: BaseSet
+    base_tree: FollowingTree
+    own: TracedSet | None
+    own_degree: int
+    measured: bool
+    watched: bool
+
+    def transmit(self, frame: Frame, rays: GlassRays) -> Transmission:
+        """C_t of the traced pixels: what the first bounce meets, and behind the object the second."""
+        degree = self.base.sh_degree(frame.step)
+        first, observations = self._first_bounce(rays, degree)
+        assert first.colors is not None
+        color = first.colors
+        if self.settings.transmittance.second_bounce != "none" and not self.mesh.flat:
+            color = self._second_bounce(rays, first, color, degree)
+        full = torch.zeros(3, rays.count).index_copy(1, rays.rows, color.T)
+        return Transmission(full, self._depths(rays, first) if self.measured else None, observations)
+
+    def _first_bounce(self, rays: GlassRays, degree: int) -> tuple[TraceBuffers, tuple[Observation, ...]]:
+        """Through the transmittance set, or through the base set inside the object."""
+        settings = self.settings.transmittance
+        thickness = rays.far - rays.near
+        origins, directions = rays.at(rays.near)
+        depth = self.measured or settings.second_bounce == "first_bounce"
+        start = settings.offset * self.base.extent
+        if self.own is None:
+            return self._trace_base(origins, directions, self._options(start, thickness, degree, depth)), ()
+        clip = settings.first_bounce_end == "clip"
+        bound = torch.where(rays.second, thickness, torch.inf) if clip else torch.inf
+        options = replace(self._options(start, bound, self.own_degree, depth), weight_sum=self.watched)
+        return self.own.trace(origins, directions, options, watched=self.watched)
+
+    def _second_bounce(self, rays: GlassRays, first: TraceBuffers, color: Tensor, degree: int) -> Tensor:
+        """(R, 3) the first bounce's colour and, composited, what the base set shows behind the object."""
+        settings = self.settings.transmittance
+        left = 1 - first.alpha
+        over = settings.compositing == "over"
+        rows = (left.detach() > settings.opaque).nonzero()[:, 0] if over else torch.arange(len(left))
+        back = rays.far
+        if settings.second_bounce == "first_bounce":
+            assert first.depth is not None
+            back = rays.near + first.depth.detach()
+        origins, directions = rays.at(back[rows], rows)
+        start = settings.second_offset * self.mesh.voxel / directions.norm(dim=1)
+        options = self._options(start, torch.inf, degree, False)
+        with torch.set_grad_enabled(torch.is_grad_enabled() and settings.second_bounce_gradient):
+            second = self._trace_base(origins, directions, options).colors
+        assert second is not None
+        return color.index_add(0, rows, left[rows, None] * second if over else second)
+
+    def _depths(self, rays: GlassRays, first: TraceBuffers) -> FirstBounce:
+        """Depths of the rays that have a second surface; with ``per_hit`` also what lies behind it."""
+        rows = rays.second.nonzero()[:, 0]
+        thickness = (rays.far - rays.near)[rows]
+        assert first.depth is not None
+        depth, alpha, beyond = first.depth[rows], first.alpha[rows], None
+        if self.settings.loss.transmission_depth_form == "per_hit":
+            assert self.own is not None
+            start = self.settings.transmittance.offset * self.base.extent
+            options = self._options(start, thickness, self.own_degree, True)
+            near, _ = self.own.trace(*rays.at(rays.near[rows], rows), options, watched=False)
+            assert near.depth is not None
+            beyond = depth - near.depth - thickness * (alpha - near.alpha)
+        return FirstBounce(depth, alpha, thickness, beyond)
+
+    def _options(self, start: float | Tensor, end: float | Tensor, degree: int, depth: bool) -> TraceOptions:
+        settings = self.settings.transmittance
+        return TraceOptions(
+            t_min=start,
+            t_max=end,
+            transmittance_cutoff=settings.transmittance_cutoff,
+            alpha_cutoff=settings.alpha_cutoff,
+            sh_degree=degree,
+            depth=depth,
+            sh_direction=self.settings.reflection.sh_direction,  # type: ignore[arg-type]
+        )
+
+    def _trace_base(self, origins: Tensor, directions: Tensor, options: TraceOptions) -> TraceBuffers:
+        """Through the base set: its SH colours alone, no reflection in it; the interface is not met."""
+        gaussians = self.base.set.gaussians
+        assert isinstance(gaussians, Surfels)
+        return trace_set(gaussians, self.base_tree, origins, directions, options)

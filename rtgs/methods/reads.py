@@ -1,0 +1,48 @@
+"""What the stages of the surfel family read of their settings: runs that differ in the rest share an artifact."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from rtgs.optics.settings import OpticsSettings
+from rtgs.train.settings import (
+    LossSettings,
+    MethodSettings,
+    OptimizerSettings,
+    ReflectionSettings,
+    TransmittanceSettings,
+)
+from rtgs.train.specular_settings import MaterialSettings
+
+_SECOND_STAGE_LOSSES = ("perceptual", "specular")
+_THIRD_STAGE_LOSSES = ("transmission_depth",)
+_MATERIAL_RATES = ("specular_logits", "roughness_logits", "f0_logits")
+_UNREAD = TransmittanceSettings(enabled=False)
+
+
+def diffuse_alone(settings: MethodSettings) -> MethodSettings:
+    """Nothing of materials, optics, reflection and transmittance."""
+    rates = {name: getattr(OptimizerSettings(), name) for name in _MATERIAL_RATES}
+    return replace(
+        settings,
+        materials=MaterialSettings(),
+        optics=OpticsSettings(),
+        reflection=ReflectionSettings(),
+        transmittance=_UNREAD,
+        loss=_without_losses(settings.loss, (*_SECOND_STAGE_LOSSES, *_THIRD_STAGE_LOSSES)),
+        optimizer=replace(settings.optimizer, **rates),
+    )
+
+
+def without_transmittance(settings: MethodSettings) -> MethodSettings:
+    """Nothing of transmittance, and L_spec only where it starts before the third stage does."""
+    masks = settings.transmittance.enabled and settings.loss.specular_start < settings.transmittance.start
+    unread = _THIRD_STAGE_LOSSES if masks else (*_THIRD_STAGE_LOSSES, "specular")
+    # The start stays where L_spec is read, so that this function finds the same when it is asked again.
+    kept = replace(_UNREAD, enabled=True, start=settings.transmittance.start) if masks else _UNREAD
+    return replace(settings, transmittance=kept, loss=_without_losses(settings.loss, unread))
+
+
+def _without_losses(loss: LossSettings, prefixes: tuple[str, ...]) -> LossSettings:
+    default = LossSettings()
+    return replace(loss, **{name: getattr(default, name) for name in vars(default) if name.startswith(prefixes)})

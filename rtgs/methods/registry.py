@@ -1,0 +1,67 @@
+"""Which methods there are: those of this package, those of installed ones, and any that a config names by its place.
+
+Without torch. ``method.name`` is one of
+
+- ``2dgs``, ``3dgs``, ``envgs``, ``rtgs``: of this package;
+- a name that an installed package declares as an entry point of the group ``rtgs.methods``;
+- ``package.module:ATTRIBUTE``, any importable :class:`~rtgs.methods.spec.MethodSpec`.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+from importlib import metadata
+
+from rtgs.methods import envgs, gs2d, gs3d, rtgs
+from rtgs.methods.spec import MethodSpec
+
+ENTRY_POINTS = "rtgs.methods"
+_OWN = {spec.name: spec for spec in (gs2d.SPEC, gs3d.SPEC, envgs.SPEC, rtgs.SPEC)}
+
+
+def method_names() -> tuple[str, ...]:
+    """The names that need no place: those of this package, then those of installed ones."""
+    return (*_OWN, *sorted(set(_entry_points()) - set(_OWN)))
+
+
+def own_methods() -> tuple[MethodSpec, ...]:
+    """The methods of this package."""
+    return tuple(_OWN.values())
+
+
+def find_method(name: str) -> MethodSpec:
+    """The method ``name``.
+
+    Raises:
+        ValueError: there is none of this name, or its place holds none.
+    """
+    if name in _OWN:
+        return _OWN[name]
+    place = name if ":" in name else _entry_points().get(name, "")
+    if not place:
+        names = method_names()
+        close = difflib.get_close_matches(name, names, n=1)
+        hint = f"; did you mean {close[0]}?" if close else ""
+        raise ValueError(
+            f"method.name is {name!r}: choose one of {', '.join(names)}, or package.module:ATTRIBUTE of your own{hint}"
+        )
+    return _load(place, name)
+
+
+def _entry_points() -> dict[str, str]:
+    return {point.name: point.value for point in metadata.entry_points(group=ENTRY_POINTS)}
+
+
+def _load(place: str, name: str) -> MethodSpec:
+    module, _, attribute = place.partition(":")
+    try:
+        found = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ValueError(
+            f"method.name={name!r} names {place}, which does not import ({error}): install the package that holds it, "
+            "or put its folder on PYTHONPATH"
+        ) from error
+    if not isinstance(found, MethodSpec):
+        raise ValueError(f"method.name={name!r}: {place} is a {type(found).__name__}, not a rtgs.methods.MethodSpec")
+    return found

@@ -1,0 +1,150 @@
+"""A method as a value: its stages, what it has, and how its model is composed.
+
+Without torch: a plan is made of these alone. A method is one module that defines a :class:`MethodSpec` and one YAML
+file in ``conf/method`` (docs/new_method.md shows one from the first line to the last).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from rtgs.train.method import Stage
+
+if TYPE_CHECKING:
+    from rtgs.methods.model import Model, Setup
+    from rtgs.train.settings import MethodSettings, ScheduleSettings
+
+SURFACE = "surface"  # Gaussians with a normal and a depth: losses on surfaces, meshes
+MIRROR = "mirror"  # reflected light of its own
+MICROFACET = "microfacet"  # a weight of reflected light that follows from roughness and reflectance
+GLASS = "glass"  # a stage for what is seen through transparent objects
+FEATURES = (SURFACE, MIRROR, MICROFACET, GLASS)
+
+StartOf = Callable[["MethodSettings", "ScheduleSettings"], int]
+Reads = Callable[["MethodSettings"], "MethodSettings"]
+
+
+def at_once(settings: MethodSettings, schedule: ScheduleSettings) -> int:
+    """The first stage: from step 0 on."""
+    return 0
+
+
+def everything(settings: MethodSettings) -> MethodSettings:
+    """The stage reads all settings."""
+    return settings
+
+
+def always(settings: MethodSettings) -> bool:
+    """The stage is never switched off."""
+    return True
+
+
+@dataclass(frozen=True)
+class StageSpec:
+    """One stage of a method: a pipeline step ``train_<name>`` of its own, whose artifact is cached.
+
+    Attributes:
+        name: lower case; the step's name follows from it.
+        start: first step of the stage in a run with these settings; from the end of the run on, there is no stage.
+        start_key: the config key that ``start`` reads, for messages.
+        reads: the settings with fixed values where the stage reads nothing: runs that differ there share its artifact.
+        on: whether the settings ask for the stage.
+        needs_object: only for scenes with a transparent object, whose mesh is made before the stage.
+        version: of the step, raised when the stage trains otherwise than before.
+    """
+
+    name: str
+    start: StartOf = at_once
+    start_key: str = ""
+    reads: Reads = everything
+    on: Callable[[MethodSettings], bool] = always
+    needs_object: bool = False
+    version: int = 1
+
+
+@dataclass(frozen=True)
+class MethodSpec:
+    """A method.
+
+    Attributes:
+        name: as in ``method.name`` and in tables.
+        stages: in order; the first starts at step 0.
+        build: composes what trains from a :class:`rtgs.methods.model.Setup`. It imports torch, and is called when
+            something trains or renders.
+        has: which of :data:`FEATURES` it has. Ablations say what they take away, and are refused by methods without it.
+    """
+
+    name: str
+    stages: tuple[StageSpec, ...]
+    build: Callable[[Setup], Model]
+    has: frozenset[str] = frozenset()
+
+    def __post_init__(self) -> None:
+        if not self.stages or self.stages[0].start is not at_once:
+            raise ValueError(f"method {self.name!r}: its first stage must start at once (step 0)")
+        names = [stage.name for stage in self.stages]
+        if len(set(names)) < len(names):
+            raise ValueError(f"method {self.name!r} has two stages of one name: {', '.join(names)}")
+        if unknown := self.has - set(FEATURES):
+            raise ValueError(f"method {self.name!r} has {', '.join(sorted(unknown))}: known are {', '.join(FEATURES)}")
+
+    def stage(self, name: str) -> StageSpec:
+        """The stage of this name.
+
+        Raises:
+            ValueError: the method has none.
+        """
+        for stage in self.stages:
+            if stage.name == name:
+                return stage
+        names = ", ".join(stage.name for stage in self.stages)
+        raise ValueError(f"method {self.name} has no stage {name!r}: it has {names}")
+
+    def object_stage(self, settings: MethodSettings) -> StageSpec | None:
+        """The stage that needs a transparent object's mesh, where the settings ask for it."""
+        return next((stage for stage in self.stages if stage.needs_object and stage.on(settings)), None)
+
+    def timeline(
+        self, settings: MethodSettings, schedule: ScheduleSettings, *, transparent: bool = False
+    ) -> tuple[Stage, ...]:
+        """The stages that a run under ``schedule`` goes through, in order.
+
+        ``transparent``: the scene has a transparent object (masks that are not empty).
+
+        Raises:
+            ValueError: a stage would start before the one before it.
+        """
+        total = schedule.total
+        begun: list[tuple[StageSpec, int]] = []
+        for stage in self.stages:
+            first = min(stage.start(settings, schedule), total)
+            if not stage.on(settings) or (stage.needs_object and not transparent):
+                continue
+            if len(begun) > 1 and first <= begun[-1][1]:
+                self._refuse_order(begun[-1], (stage, first), settings, total)
+            begun.append((stage, first))
+            if first >= total:
+                break
+        ends = [first for _, first in begun[1:]] + [total]
+        return tuple(Stage(stage.name, first, end) for (stage, first), end in zip(begun, ends) if first < end)
+
+    def _refuse_order(
+        self, before: tuple[StageSpec, int], late: tuple[StageSpec, int], settings: MethodSettings, total: int
+    ) -> None:
+        (one, first), (two, second) = before, late
+        raise ValueError(
+            f"{two.start_key}={_value(settings, two.start_key):g} is step {second} of {total}, but the {one.name} "
+            f"stage before it starts at step {first} ({one.start_key}={_value(settings, one.start_key):g}): "
+            "let it start later"
+        )
+
+
+def _value(settings: MethodSettings, key: str) -> float:
+    """The value of a dotted key ``method.a.b``."""
+    value: object = settings
+    for part in key.split(".")[1:]:
+        value = getattr(value, part)
+    assert isinstance(value, (int, float))
+    return float(value)

@@ -1,0 +1,102 @@
+"""Loss terms: one idiom for all of them. A term is a value, a weight, when it acts, and the maps it needs.
+
+A term of weight 0 is never made, so it costs nothing, and neither does a map that only it needs: the maps of a
+training view are the union of what the terms of its step ask for.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from rtgs.core.decisions import Decision
+from rtgs.train.losses import photometric_loss
+from rtgs.train.method import LossValue, LossValues, RenderedView, RenderOptions
+from rtgs.train.schedule import loss_start
+
+if TYPE_CHECKING:
+    from rtgs.scenes.scene import View
+    from rtgs.train.settings import LossSettings
+
+NO_MAPS = RenderOptions()
+
+TermValue = Callable[[RenderedView, "View"], Tensor | None]
+"""From a rendered view and the photo to the unweighted scalar; None: this view gives the term nothing to act on."""
+
+
+@dataclass(frozen=True)
+class LossTerm:
+    """One weighted term.
+
+    Attributes:
+        name: in the log and in the guard's report.
+        weight: above 0; a term of weight 0 is not made.
+        value: the unweighted scalar with its graph, or None where the view has nothing for it.
+        start: first step at which the term acts.
+        until: first step at which it no longer does.
+        needs: maps of the base set that :attr:`value` reads.
+    """
+
+    name: str
+    weight: float
+    value: TermValue
+    start: int = 0
+    until: float = math.inf
+    needs: RenderOptions = NO_MAPS
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.weight) and self.weight > 0):
+            raise ValueError(f"loss term {self.name!r} has the weight {self.weight}: leave it out, or give one above 0")
+
+    def acts(self, step: int) -> bool:
+        """Whether the term is on at ``step``."""
+        return self.start <= step < self.until
+
+
+@dataclass(frozen=True)
+class LossTable:
+    """The loss of a method: L1 and D-SSIM of the image (one fused kernel), and its terms in the order of the log."""
+
+    l1: float
+    dssim: float
+    terms: tuple[LossTerm, ...] = ()
+
+    def needs(self, step: int) -> RenderOptions:
+        """The maps that the terms of ``step`` read, and no others."""
+        wanted = NO_MAPS
+        for term in self.terms:
+            wanted = wanted.plus(term.needs) if term.acts(step) else wanted
+        return wanted
+
+    def evaluate(self, rendered: RenderedView, view: View, step: int) -> LossValues:
+        """The weighted sum of what acts at ``step``."""
+        photometric = photometric_loss(rendered.image, view.image, self.l1, self.dssim)
+        first = (LossValue("l1", photometric.l1, self.l1), LossValue("dssim", photometric.dssim, self.dssim))
+        found = LossValues(photometric.total, first)
+        for term in self.terms:
+            if term.acts(step) and (value := term.value(rendered, view)) is not None:
+                found = found.plus(term.name, value, term.weight)
+        return found
+
+    def plus(self, terms: Iterable[LossTerm]) -> LossTable:
+        """With more terms behind those that are there."""
+        return LossTable(self.l1, self.dssim, (*self.terms, *terms))
+
+
+def table_of(settings: LossSettings, terms: Iterable[LossTerm]) -> LossTable:
+    """The table with the photometric weights of the settings."""
+    return LossTable(settings.l1, settings.dssim, tuple(terms))
+
+
+def term_start(name: str, weight: float, share: float, total: int, method: str) -> int | Decision:
+    """First step of a term that starts after ``share`` of a run of ``total`` steps, or why the run is without it."""
+    if weight == 0:
+        return Decision(f"no {name} loss", f"its weight is 0 in method {method}")
+    first = loss_start(share, total)
+    if first >= total:
+        return Decision(f"no {name} loss", f"it starts after {share:g} of the run, beyond {total} steps")
+    return first
