@@ -22,9 +22,11 @@ from torch import Tensor
 
 from benchmarks.yardstick_scene import yardstick_case
 from rtgs.core.cameras import Camera
+from rtgs.gaussians.settings import OptimizerSettings
 from rtgs.gaussians.surfels import ActivatedSurfels
 from rtgs.methods.base import LossTerms, RenderedView
 from rtgs.methods.gs2d import Gs2d
+from rtgs.methods.settings import MethodSettings
 from rtgs.methods.surfel_set import SurfelSet
 from rtgs.native import core
 from rtgs.render.buffers import RasterBuffers
@@ -32,7 +34,7 @@ from rtgs.render.surfels import rasterize_surfels
 from rtgs.scenes.scene import Scene, View
 from rtgs.train.guard import check_loss
 from rtgs.train.losses import normal_consistency_loss, photometric_loss
-from rtgs.train.settings import LossSettings, MethodSettings, OptimizerSettings, ScheduleSettings
+from rtgs.train.settings import LossSettings, ScheduleSettings
 
 STEP = 10  # any step at which all SH degrees are active
 

@@ -28,7 +28,8 @@ from pipelines.steps import (
 from pipelines.steps.training import StageParams
 from rtgs.config.schema import Choices, RunConfig
 from rtgs.methods import has_third_stage, method_stages, stage_settings
-from rtgs.train.settings import MethodSettings, ScheduleSettings
+from rtgs.methods.settings import MethodSettings
+from rtgs.train.settings import ScheduleSettings
 from rtgs.workflow import Step, StepKind
 from rtgs.workflow.fingerprint import flatten
 

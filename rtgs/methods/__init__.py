@@ -15,8 +15,9 @@ from rtgs.methods.base import (
     Stage,
     StepEvent,
 )
+from rtgs.methods.settings import MethodSettings
 from rtgs.methods.stages import METHOD_NAMES, check_name, has_third_stage, method_stages, stage_settings
-from rtgs.train.settings import MethodSettings, ScheduleSettings
+from rtgs.train.settings import ScheduleSettings
 
 if TYPE_CHECKING:
     import torch

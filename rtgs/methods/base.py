@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
-from rtgs.train.settings import MethodSettings, ScheduleSettings
+from rtgs.methods.settings import MethodSettings
+from rtgs.train.settings import ScheduleSettings
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -19,11 +19,12 @@ from rtgs.methods.glass_evidence import glass_faces, masked_views, on_surface, s
 from rtgs.methods.interface_set import InterfaceSet, interface_surfels
 from rtgs.methods.reflection_set import ReflectionSet
 from rtgs.methods.reflective import ReflectiveMethod
+from rtgs.methods.settings import MethodSettings
 from rtgs.methods.stages import method_stages
 from rtgs.methods.traced_set import FollowingTree
 from rtgs.methods.transmittance_set import initial_box, random_surfels, rows_inside, take_out
 from rtgs.train.schedule import reflection_plan, transmittance_plan
-from rtgs.train.settings import MethodSettings, ScheduleSettings
+from rtgs.train.settings import ScheduleSettings
 
 if TYPE_CHECKING:
     from rtgs.scenes.scene import Scene, View

@@ -9,10 +9,11 @@ import torch
 from rtgs.core.cameras import Camera
 from rtgs.gaussians.ellipsoids import Ellipsoids
 from rtgs.methods.base import RenderOptions
+from rtgs.methods.settings import MethodSettings
 from rtgs.methods.surfel_base import SurfelMethod
 from rtgs.render.buffers import EllipsoidOptions, RasterBuffers
 from rtgs.render.ellipsoids import rasterize_ellipsoids
-from rtgs.train.settings import MethodSettings, ScheduleSettings
+from rtgs.train.settings import ScheduleSettings
 
 if TYPE_CHECKING:
     from rtgs.scenes.scene import Scene

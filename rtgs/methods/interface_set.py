@@ -15,8 +15,8 @@ from rtgs.gaussians.materials import MaterialSurfels, with_materials
 from rtgs.gaussians.primitives import tangents
 from rtgs.gaussians.surfels import Surfels
 from rtgs.mesh.container import ObjectMesh
+from rtgs.methods.settings import MethodSettings
 from rtgs.methods.surfel_set import SurfelSet
-from rtgs.train.settings import MethodSettings
 
 _NORMALS = "normals"  # in the state
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
+from rtgs.gaussians.settings import DensitySettings
 from rtgs.methods.base import Decision
-from rtgs.train.settings import DensitySettings, MethodSettings
+from rtgs.methods.settings import MethodSettings
 
 
 def within_pixels(density: DensitySettings, pixels: int) -> DensitySettings:

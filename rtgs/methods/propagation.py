@@ -9,8 +9,8 @@ import torch
 from rtgs.gaussians.density import logit
 from rtgs.gaussians.materials import MaterialSurfels
 from rtgs.methods.base import StepEvent
+from rtgs.methods.settings import PropagationSettings
 from rtgs.methods.surfel_set import SurfelSet
-from rtgs.train.specular_settings import PropagationSettings
 
 
 @torch.no_grad()

@@ -9,11 +9,12 @@ from torch import Tensor
 
 from rtgs.gaussians.density import DensityReport
 from rtgs.gaussians.initialize import points_box
+from rtgs.gaussians.settings import DensitySettings, OptimizerSettings
 from rtgs.gaussians.surfels import Surfels
+from rtgs.methods.settings import ReflectionSettings
 from rtgs.methods.surfel_set import SurfelSet
 from rtgs.methods.traced_set import FollowingTree, stratified_surfels, trace_set
 from rtgs.render.buffers import TraceBuffers, TraceOptions
-from rtgs.train.settings import DensitySettings, OptimizerSettings, ReflectionSettings
 
 PIXEL_STRIDE = 37  # of the training pixels that a scene's colour is taken from
 

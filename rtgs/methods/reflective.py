@@ -39,6 +39,7 @@ from rtgs.methods.mirror import (
 from rtgs.methods.pixel_maps import full_map, specular_layers, take_pixels
 from rtgs.methods.propagation import propagate_normals, reset_specular
 from rtgs.methods.reflection_set import ReflectionSet, reflection_surfels, scene_color
+from rtgs.methods.settings import MethodSettings
 from rtgs.methods.surfel_base import SurfelMethod
 from rtgs.methods.traced_pixels import TracedPixels, choose_pixels
 from rtgs.optics.light import decoded, encoded
@@ -58,7 +59,7 @@ from rtgs.train.schedule import (
     reflection_reset_due,
     sh_degree_at,
 )
-from rtgs.train.settings import MethodSettings, ScheduleSettings
+from rtgs.train.settings import ScheduleSettings
 
 if TYPE_CHECKING:
     from rtgs.scenes.scene import Scene, View

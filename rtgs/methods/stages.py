@@ -7,18 +7,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from rtgs.gaussians.settings import MaterialSettings, OptimizerSettings
 from rtgs.methods.base import Stage
+from rtgs.methods.settings import MethodSettings, ReflectionSettings, TransmittanceSettings
 from rtgs.optics.settings import OpticsSettings
 from rtgs.train.schedule import reflection_plan, transmittance_plan
-from rtgs.train.settings import (
-    LossSettings,
-    MethodSettings,
-    OptimizerSettings,
-    ReflectionSettings,
-    ScheduleSettings,
-    TransmittanceSettings,
-)
-from rtgs.train.specular_settings import MaterialSettings
+from rtgs.train.settings import LossSettings, ScheduleSettings
 
 METHOD_NAMES = ("2dgs", "3dgs", "envgs", "rtgs")
 _OF_ONE_STAGE = ("2dgs", "3dgs")

@@ -15,6 +15,7 @@ from rtgs.gaussians.primitives import Gaussians
 from rtgs.gaussians.surfels import ActivatedSurfels, Surfels
 from rtgs.methods.base import Decision, LossTerm, LossTerms, RenderedView, RenderOptions, Stage, StepEvent
 from rtgs.methods.pixel_bound import bound_by_pixels
+from rtgs.methods.settings import MethodSettings
 from rtgs.methods.stages import method_stages
 from rtgs.methods.surfel_set import SurfelSet
 from rtgs.render.buffers import RasterBuffers, RasterOptions
@@ -36,7 +37,7 @@ from rtgs.train.schedule import (
     opacity_was_reset,
     sh_degree_at,
 )
-from rtgs.train.settings import MethodSettings, ScheduleSettings
+from rtgs.train.settings import ScheduleSettings
 
 if TYPE_CHECKING:
     from rtgs.scenes.scene import Scene, View

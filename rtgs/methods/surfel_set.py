@@ -13,8 +13,8 @@ from rtgs.gaussians.adam import SurfelAdam
 from rtgs.gaussians.density import DensityReport
 from rtgs.gaussians.mcmc import density_control
 from rtgs.gaussians.primitives import Gaussians
+from rtgs.gaussians.settings import DensitySettings, OptimizerSettings
 from rtgs.gaussians.surfels import ActivatedSurfels
-from rtgs.train.settings import DensitySettings, OptimizerSettings
 
 
 @dataclass(frozen=True)

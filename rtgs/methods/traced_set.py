@@ -7,10 +7,10 @@ from torch import Tensor
 
 from rtgs.gaussians.activate import activate_geometry
 from rtgs.gaussians.initialize import surfels_from_points
+from rtgs.gaussians.settings import InitSettings
 from rtgs.gaussians.surfels import Surfels
 from rtgs.render.buffers import TraceBuffers, TraceOptions
 from rtgs.render.trace import SurfelTree, trace_surfels
-from rtgs.train.settings import InitSettings
 
 
 class FollowingTree:

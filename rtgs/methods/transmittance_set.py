@@ -15,9 +15,9 @@ from rtgs.gaussians.initialize import points_box
 from rtgs.gaussians.materials import MaterialSurfels, without_materials
 from rtgs.gaussians.surfels import Surfels
 from rtgs.mesh.container import ObjectMesh
+from rtgs.methods.settings import TransmittanceSettings
 from rtgs.methods.surfel_set import SurfelSet
 from rtgs.methods.traced_set import stratified_surfels
-from rtgs.train.settings import TransmittanceSettings
 
 
 def rows_inside(surfels: Surfels, mesh: ObjectMesh, margin: float, cameras: Sequence[Camera]) -> Tensor:

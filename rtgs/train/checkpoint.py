@@ -20,7 +20,8 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from rtgs.core.errors import RtgsError
-from rtgs.train.settings import MethodSettings, ScheduleSettings
+from rtgs.methods.settings import MethodSettings
+from rtgs.train.settings import ScheduleSettings
 
 FORMAT = 1
 TENSORS_FILE = "state.safetensors"

@@ -7,20 +7,19 @@ from pathlib import Path
 
 from mirror_scene import MirrorScene, mirror_scene
 
+from rtgs.gaussians.settings import DensitySettings, InitSettings, OptimizerSettings
 from rtgs.methods import create_method
 from rtgs.methods.reflective import ReflectiveMethod
+from rtgs.methods.settings import (
+    MatteSettings,
+    MethodSettings,
+    PropagationSettings,
+    ReflectionSettings,
+    TracedShareSettings,
+)
 from rtgs.optics.settings import OpticsSettings
 from rtgs.train.seeds import generator_for
-from rtgs.train.settings import (
-    DensitySettings,
-    InitSettings,
-    LossSettings,
-    MethodSettings,
-    OptimizerSettings,
-    ReflectionSettings,
-    ScheduleSettings,
-)
-from rtgs.train.specular_settings import MatteSettings, PropagationSettings, TracedShareSettings
+from rtgs.train.settings import LossSettings, ScheduleSettings
 from rtgs.train.trainer import Trainer
 
 NEVER_MATTE = MatteSettings(probation=0.0)

@@ -10,6 +10,7 @@ from reflective_cases import new_method, recipe, schedule, tiny
 from torch import Tensor
 
 from rtgs.gaussians.materials import activate_materials
+from rtgs.gaussians.settings import MaterialSettings
 from rtgs.gaussians.surfels import activate
 from rtgs.methods import Stage
 from rtgs.methods.mirror import (
@@ -21,12 +22,12 @@ from rtgs.methods.mirror import (
 )
 from rtgs.methods.reflection_set import scene_color
 from rtgs.methods.reflective import ReflectiveMethod
+from rtgs.methods.settings import PropagationSettings
 from rtgs.optics.settings import OpticsSettings
 from rtgs.render.discontinuities.surfels import discontinuity_mask
 from rtgs.render.discontinuities.trace import fragile_rays
 from rtgs.render.reference import surfels as reference
 from rtgs.render.reference import trace as reference_trace
-from rtgs.train.specular_settings import MaterialSettings, PropagationSettings
 
 STEP = 40  # SH of degree 2 in both sets
 

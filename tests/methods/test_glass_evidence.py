@@ -19,9 +19,9 @@ from rtgs.methods.glass import glass_pixels, widened
 from rtgs.methods.glass_evidence import glass_faces, on_surface, seen_bare
 from rtgs.methods.interface_set import normal_quaternions
 from rtgs.methods.mirror import SurfacePixels
+from rtgs.methods.settings import InterfaceSettings
 from rtgs.methods.transmittance import TransmissiveMethod
 from rtgs.scenes.scene import View
-from rtgs.train.specular_settings import InterfaceSettings
 
 LABEL = -0.1  # of the radius: above this height the ball is covered
 VOTED = InterfaceSettings(count=150, masked_share=0.5)

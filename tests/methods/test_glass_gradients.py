@@ -9,7 +9,8 @@ import torch
 from glass_cases import begun, glass_recipe, glass_scene, randomised
 from glass_twin import GlassTwin, doubled
 
-from rtgs.train.specular_settings import InterfaceSettings, MaterialSettings
+from rtgs.gaussians.settings import MaterialSettings
+from rtgs.methods.settings import InterfaceSettings
 
 STEP = 40  # SH of degree 2 in the base set
 

@@ -11,7 +11,7 @@ from mirror_scene import BALL
 
 from rtgs.gaussians.density import select_rows
 from rtgs.methods.interface_set import interface_surfels, normal_quaternions
-from rtgs.train.specular_settings import InterfaceSettings
+from rtgs.methods.settings import InterfaceSettings
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,9 @@ import pytest
 import torch
 from reflective_cases import new_method, recipe, schedule, tiny
 
+from rtgs.gaussians.settings import MaterialSettings
 from rtgs.methods import RenderOptions, Stage, reflective
+from rtgs.methods.settings import MatteSettings, TracedShareSettings
 from rtgs.methods.traced_pixels import choose_pixels
 from rtgs.optics.settings import OpticsSettings
 from rtgs.train.schedule import (
@@ -19,7 +21,6 @@ from rtgs.train.schedule import (
     propagation_due,
     reflection_reset_due,
 )
-from rtgs.train.specular_settings import MaterialSettings, MatteSettings, TracedShareSettings
 
 
 def test_every_event_of_the_plan_happens_and_no_other():

@@ -16,10 +16,9 @@ from rtgs.evaluate.boundary import boundary_scores
 from rtgs.gaussians.density import logit
 from rtgs.mesh.triangles import TriangleMesh
 from rtgs.methods import RenderOptions, Stage, create_method, method_stages
+from rtgs.methods.settings import InterfaceSettings, MethodSettings, TransmittanceSettings
 from rtgs.methods.transmittance_set import random_surfels
 from rtgs.train.seeds import generator_for
-from rtgs.train.settings import MethodSettings, TransmittanceSettings
-from rtgs.train.specular_settings import InterfaceSettings
 from rtgs.train.trainer import Trainer
 
 LAYERS = RenderOptions(layers=True)

@@ -8,7 +8,7 @@ import pytest
 import torch
 from training_cases import small_method, small_scene, small_schedule, small_trainer
 
-from rtgs.train.settings import OptimizerSettings
+from rtgs.gaussians.settings import OptimizerSettings
 
 
 def violent(factor: float) -> OptimizerSettings:
