@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from rtgs.gaussians.settings import MaterialSettings, OptimizerSettings
 from rtgs.methods.base import Stage
-from rtgs.methods.settings import MethodSettings, ReflectionSettings, TransmittanceSettings
+from rtgs.methods.settings import UNREAD_TRANSMITTANCE, MethodSettings, ReflectionSettings
 from rtgs.optics.settings import OpticsSettings
 from rtgs.train.schedule import reflection_plan, transmittance_plan
 from rtgs.train.settings import LossSettings, ScheduleSettings
@@ -80,7 +80,7 @@ def stage_settings(settings: MethodSettings, stage: str) -> MethodSettings:
             materials=MaterialSettings(),
             optics=OpticsSettings(),
             reflection=ReflectionSettings(),
-            transmittance=_UNREAD,
+            transmittance=UNREAD_TRANSMITTANCE,
             loss=_without_losses(settings.loss, (*_SECOND_STAGE_LOSSES, *_THIRD_STAGE_LOSSES)),
             optimizer=replace(settings.optimizer, **rates),
         )
@@ -88,12 +88,13 @@ def stage_settings(settings: MethodSettings, stage: str) -> MethodSettings:
         masks = settings.transmittance.enabled and settings.loss.specular_start < settings.transmittance.start
         unread = _THIRD_STAGE_LOSSES if masks else (*_THIRD_STAGE_LOSSES, "specular")
         # The start stays where L_spec is read, so that this function finds the same when it is asked again.
-        kept = replace(_UNREAD, enabled=True, start=settings.transmittance.start) if masks else _UNREAD
+        kept = (
+            replace(UNREAD_TRANSMITTANCE, enabled=True, start=settings.transmittance.start)
+            if masks
+            else UNREAD_TRANSMITTANCE
+        )
         return replace(settings, transmittance=kept, loss=_without_losses(settings.loss, unread))
     return settings
-
-
-_UNREAD = TransmittanceSettings(enabled=False)
 
 
 def _without_losses(loss: LossSettings, prefixes: tuple[str, ...]) -> LossSettings:
