@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from rtgs.config.schema import RunConfig
     from rtgs.mesh.container import ObjectMesh
     from rtgs.methods import Method, Stage
+    from rtgs.methods.model import Model
     from rtgs.scenes.scene import Scene
 
 PARTS = ("raster", "trace", "tree", "activate", "losses", "adam", "density", "choose", "shading")
@@ -158,7 +159,7 @@ def clocks(clock: PartClock) -> Iterator[None]:
 
 
 def stage_shares(
-    method: Method, scene: Scene, seed: int, now: Callable[[], float], stage: Stage, preset_steps: int
+    method: Model, scene: Scene, seed: int, now: Callable[[], float], stage: Stage, preset_steps: int
 ) -> StageShares:
     """Train one stage of the method under the clocks; ``preset_steps``: in the schedule as it is."""
     from rtgs.train.trainer import Trainer
@@ -179,16 +180,17 @@ def stage_shares(
     return StageShares(stage.name, *timed, shares, fixed / seconds, rays, hits, surfels)
 
 
-def found_mesh(method: Method, step: int, scene: Scene, config: RunConfig) -> ObjectMesh:
+def found_mesh(method: Model, step: int, scene: Scene, config: RunConfig) -> ObjectMesh:
     """The transparent object's mesh, as the step ``extract_mesh`` of a run finds it."""
     from pipelines.steps.extract_mesh import find_object_mesh, object_params
 
     return find_object_mesh(method, step, scene, object_params(config))[0].mesh
 
 
-def fixed_seconds(method: Method, scene: Scene, stage: Stage, now: Callable[[], float]) -> float:
+def fixed_seconds(method: Model, scene: Scene, stage: Stage, now: Callable[[], float]) -> float:
     """Median seconds of a step with next to nothing in it: a picture 16 pixels wide, sets of some hundred surfels."""
     from rtgs.methods import Mode, create_method
+    from rtgs.methods.parts.glass import Glass
     from rtgs.train.seeds import generator_for
 
     view = next((view for view in scene.train if view.mask is not None and view.mask.any()), scene.train[0])
@@ -197,7 +199,8 @@ def fixed_seconds(method: Method, scene: Scene, stage: Stage, now: Callable[[], 
     def shrunk(maps: torch.Tensor | None) -> torch.Tensor | None:
         return None if maps is None else maps[..., :height, :SMALL_WIDTH].contiguous()
 
-    guide = getattr(method, "guide", None)
+    glass = method.parts.get("glass")
+    guide = glass.guide if isinstance(glass, Glass) else None
     mask = None
     if guide is not None and view.mask is not None:
         mask = torch.nn.functional.interpolate(view.mask[None, None].float(), (height, SMALL_WIDTH))[0, 0] > 0

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from rtgs.methods.plans import reflection_plan, transmittance_plan
 from rtgs.methods.reads import diffuse_alone, without_transmittance
 from rtgs.methods.spec import StageSpec
-from rtgs.train.schedule import reflection_plan, transmittance_plan
 
 if TYPE_CHECKING:
-    from rtgs.train.settings import MethodSettings, ScheduleSettings
+    from rtgs.methods.settings import MethodSettings
+    from rtgs.train.settings import ScheduleSettings
 
 
 def _reflection_start(settings: MethodSettings, schedule: ScheduleSettings) -> int:

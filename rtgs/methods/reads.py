@@ -4,20 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from rtgs.gaussians.settings import MaterialSettings, OptimizerSettings
+from rtgs.methods.settings import UNREAD_TRANSMITTANCE, MethodSettings, ReflectionSettings
 from rtgs.optics.settings import OpticsSettings
-from rtgs.train.settings import (
-    LossSettings,
-    MethodSettings,
-    OptimizerSettings,
-    ReflectionSettings,
-    TransmittanceSettings,
-)
-from rtgs.train.specular_settings import MaterialSettings
+from rtgs.train.settings import LossSettings
 
 _SECOND_STAGE_LOSSES = ("perceptual", "specular")
 _THIRD_STAGE_LOSSES = ("transmission_depth",)
 _MATERIAL_RATES = ("specular_logits", "roughness_logits", "f0_logits")
-_UNREAD = TransmittanceSettings(enabled=False)
 
 
 def diffuse_alone(settings: MethodSettings) -> MethodSettings:
@@ -28,7 +22,7 @@ def diffuse_alone(settings: MethodSettings) -> MethodSettings:
         materials=MaterialSettings(),
         optics=OpticsSettings(),
         reflection=ReflectionSettings(),
-        transmittance=_UNREAD,
+        transmittance=UNREAD_TRANSMITTANCE,
         loss=_without_losses(settings.loss, (*_SECOND_STAGE_LOSSES, *_THIRD_STAGE_LOSSES)),
         optimizer=replace(settings.optimizer, **rates),
     )
@@ -39,7 +33,11 @@ def without_transmittance(settings: MethodSettings) -> MethodSettings:
     masks = settings.transmittance.enabled and settings.loss.specular_start < settings.transmittance.start
     unread = _THIRD_STAGE_LOSSES if masks else (*_THIRD_STAGE_LOSSES, "specular")
     # The start stays where L_spec is read, so that this function finds the same when it is asked again.
-    kept = replace(_UNREAD, enabled=True, start=settings.transmittance.start) if masks else _UNREAD
+    kept = (
+        replace(UNREAD_TRANSMITTANCE, enabled=True, start=settings.transmittance.start)
+        if masks
+        else UNREAD_TRANSMITTANCE
+    )
     return replace(settings, transmittance=kept, loss=_without_losses(settings.loss, unread))
 
 

@@ -223,5 +223,5 @@ def test_misspelt_choices() -> None:
     masks = masks_of(sphere(0.8, 16), ring(6))
     with pytest.raises(RtgsError, match="source is 'hul'"):
         chosen("hul", masks)
-    with pytest.raises(ValueError, match=r"mesh\.object\.flat=maybe must be auto or yes or no"):
+    with pytest.raises(ValueError, match=r"mesh\.object\.flat='maybe' is unknown: choose one of auto, yes, no"):
         replace(SETTINGS, flat="maybe")

@@ -11,23 +11,19 @@ from mirror_scene import BALL, RADIUS, ball_hit, mirror_scene, room_hit, wall_co
 from reflective_cases import recipe, schedule
 from torch import Tensor
 
+from rtgs.gaussians.settings import DensitySettings, InitSettings
 from rtgs.mesh.container import ObjectMesh
 from rtgs.mesh.triangles import TriangleMesh
 from rtgs.methods import create_method
 from rtgs.methods.model import Model
+from rtgs.methods.settings import InterfaceSettings, MethodSettings, TransmittanceSettings
 from rtgs.scenes.scene import Scene, View
 from rtgs.train.seeds import generator_for
-from rtgs.train.settings import (
-    DensitySettings,
-    InitSettings,
-    MethodSettings,
-    ScheduleSettings,
-    TransmittanceSettings,
-)
-from rtgs.train.specular_settings import InterfaceSettings
+from rtgs.train.settings import ScheduleSettings
 from rtgs.train.trainer import Trainer
 
 CORE = 0.3  # radius of what is inside
+INTERFACE = InterfaceSettings(count=150, normal_loss=0.2, normal_hold=0.0)  # the loss that depends on the picture
 REFLECTED = 0.25  # share of light that the glass reflects
 
 
@@ -110,7 +106,8 @@ def glass_recipe(**changes) -> MethodSettings:
         sh_every=10,
         rim=0,  # of a 24x18 picture 2 pixels are much
         keep_seen=0,
-        interface=InterfaceSettings(count=150),
+        max_gain=None,
+        interface=INTERFACE,
         density=DensitySettings(gradient_threshold=1e-6, max_surfels=600, min_opacity=0.005),
         init=InitSettings(scale=0.5),
     )
@@ -165,4 +162,4 @@ def randomised(method: Model, seed: int = 4) -> Tensor | None:
 
 def held(weight: float, rate: float = 0.0) -> MethodSettings:
     """Normals held by ``weight``, and nothing else that holds them."""
-    return glass_recipe(interface=InterfaceSettings(count=150, normal_loss=rate, normal_hold=weight))
+    return glass_recipe(interface=replace(INTERFACE, normal_loss=rate, normal_hold=weight))

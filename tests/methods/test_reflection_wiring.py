@@ -9,18 +9,14 @@ import pytest
 import torch
 from reflective_cases import new_method, recipe, schedule, tiny
 
+from rtgs.gaussians.settings import MaterialSettings
 from rtgs.methods import Mode, RenderOptions, Stage
 from rtgs.methods.parts import mirror
+from rtgs.methods.plans import base_densify_due, base_reset_due, propagation_due, reflection_reset_due
+from rtgs.methods.settings import MatteSettings, TracedShareSettings
 from rtgs.methods.shading.traced_pixels import choose_pixels
 from rtgs.optics.settings import OpticsSettings
-from rtgs.train.schedule import (
-    base_densify_due,
-    base_reset_due,
-    densify_due,
-    propagation_due,
-    reflection_reset_due,
-)
-from rtgs.train.specular_settings import MaterialSettings, MatteSettings, TracedShareSettings
+from rtgs.train.schedule import densify_due
 
 
 def test_every_event_of_the_plan_happens_and_no_other():

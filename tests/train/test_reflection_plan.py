@@ -7,21 +7,17 @@ from dataclasses import replace
 import pytest
 
 from rtgs.config import compose
-from rtgs.train.schedule import (
+from rtgs.methods.plans import (
     base_densify_due,
     base_reset_due,
-    densify_due,
-    loss_start,
     opacities_held,
-    opacity_reset_due,
     propagation_due,
     reflection_plan,
     reflection_reset_due,
-    sh_degree_at,
     transmittance_plan,
 )
-from rtgs.train.settings import ReflectionSettings
-from rtgs.train.specular_settings import MatteSettings, PropagationSettings
+from rtgs.methods.settings import MatteSettings, PropagationSettings, ReflectionSettings
+from rtgs.train.schedule import densify_due, loss_start, opacity_reset_due, sh_degree_at
 
 
 def paper(method: str):

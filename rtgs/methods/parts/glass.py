@@ -25,6 +25,7 @@ from rtgs.methods.parts.part import Frame, Part, Rows
 from rtgs.methods.parts.straight_rays import StraightRays
 from rtgs.methods.parts.traced_set import FollowingTree, TracedSet
 from rtgs.methods.parts.transmittance_init import initial_box, random_surfels, rows_inside, take_out
+from rtgs.methods.plans import transmittance_plan
 from rtgs.methods.shading.mirror import SurfacePixels
 from rtgs.methods.shading.straight import GlassPixels, GlassRays, Transmission, glass_pixels, glass_weights, widened
 from rtgs.train.method import Mode, Observation, RenderOptions, Stage, StepEvent
@@ -35,7 +36,6 @@ from rtgs.train.schedule import (
     opacity_reset_due,
     opacity_was_reset,
     sh_degree_at,
-    transmittance_plan,
 )
 
 if TYPE_CHECKING:

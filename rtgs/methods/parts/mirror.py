@@ -22,6 +22,14 @@ from rtgs.methods.parts.part import Frame, Part, Raster
 from rtgs.methods.parts.propagation import propagate_normals, reset_specular
 from rtgs.methods.parts.reflection_init import reflection_surfels, scene_color
 from rtgs.methods.parts.traced_set import TracedSet
+from rtgs.methods.plans import (
+    base_densify_due,
+    base_reset_due,
+    opacities_held,
+    propagation_due,
+    reflection_plan,
+    reflection_reset_due,
+)
 from rtgs.methods.shading.mirror import (
     MirrorRays,
     SurfacePixels,
@@ -39,18 +47,7 @@ from rtgs.optics.light import decoded, encoded
 from rtgs.render.buffers import RasterBuffers, TraceOptions
 from rtgs.train.losses import surface_depth
 from rtgs.train.method import Mode, Observation, RenderedView, RenderOptions, Stage, StepEvent
-from rtgs.train.schedule import (
-    base_densify_due,
-    base_reset_due,
-    densify_ahead,
-    densify_due,
-    opacities_held,
-    opacity_was_reset,
-    propagation_due,
-    reflection_plan,
-    reflection_reset_due,
-    sh_degree_at,
-)
+from rtgs.train.schedule import densify_ahead, densify_due, opacity_was_reset, sh_degree_at
 from rtgs.train.settings import ScheduleSettings
 
 if TYPE_CHECKING:
