@@ -120,7 +120,7 @@ class PartClock:
 def clocks(clock: PartClock) -> Iterator[None]:
     """Every part of a step under its clock."""
     from rtgs.gaussians import activate
-    from rtgs.gaussians.adam import SurfelAdam
+    from rtgs.gaussians.adam import GaussianAdam
     from rtgs.gaussians.density import DensityControl
     from rtgs.methods.reflective import ReflectiveMethod
     from rtgs.methods.surfel_base import SurfelMethod
@@ -146,7 +146,7 @@ def clocks(clock: PartClock) -> Iterator[None]:
         (SurfelMethod, "losses", "losses"),
         (ReflectiveMethod, "losses", "losses"),
         (TransmissiveMethod, "losses", "losses"),
-        (SurfelAdam, "step", "adam"),
+        (GaussianAdam, "step", "adam"),
         (SurfelSet, "_clamp", "adam"),
         (SurfelSet, "densify", "density"),
         (DensityControl, "observe", "density"),

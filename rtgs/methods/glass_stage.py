@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -10,7 +10,9 @@ from torch import Tensor
 
 from rtgs.core.cameras import Camera
 from rtgs.core.errors import RtgsError
-from rtgs.gaussians.materials import MaterialSurfels
+from rtgs.gaussians.channels import Channel
+from rtgs.gaussians.materials import material_channels
+from rtgs.gaussians.primitives import PARAMETERS
 from rtgs.gaussians.surfels import Surfels
 from rtgs.mesh.container import ObjectGuide, ObjectMesh
 from rtgs.mesh.silhouettes import bounding
@@ -175,7 +177,7 @@ class GlassStage(ReflectiveMethod):
             rebuild_every=settings.rebuild_every,
         )
 
-    def _interface_set(self, surfels: MaterialSurfels) -> InterfaceSet:
+    def _interface_set(self, surfels: Surfels) -> InterfaceSet:
         made = InterfaceSet(
             "interface",
             surfels,
@@ -213,16 +215,17 @@ class GlassStage(ReflectiveMethod):
         self._glass = state[_GLASS].bool() if self.transparent else self._glass
         if _LEFT_OUT in state and self._left_out is None:
             self._leave_out(float(state[_LEFT_OUT]))
-        own, interface = _rows(state, "transmittance", Surfels), _rows(state, "interface", MaterialSurfels)
+        own = _rows(state, "transmittance")
+        interface = _rows(state, "interface", material_channels(self.settings.materials))
         self.transmittance = None if own is None else self._transmittance_set(own)
-        self.interface = None if interface is None else self._interface_set(interface)  # type: ignore[arg-type]
+        self.interface = None if interface is None else self._interface_set(interface)
         self._base_tree.clear()
         super().load(state)
         self._base_tree.clear()
 
 
-def _rows(state: dict[str, Tensor], name: str, kind: type[Surfels]) -> Surfels | None:
+def _rows(state: dict[str, Tensor], name: str, channels: tuple[Channel, ...] = ()) -> Surfels | None:
     """The raw surfels of a set in a state; None: it is not there."""
-    names = [field.name for field in fields(kind)]
-    found = {key: state[f"{name}.surfels.{key}"] for key in names if f"{name}.surfels.{key}" in state}
-    return kind(**{key: found[key].clone() for key in names}) if found else None
+    names = (*PARAMETERS, *(channel.name for channel in channels))
+    found = {key: state[f"{name}.surfels.{key}"].clone() for key in names if f"{name}.surfels.{key}" in state}
+    return Surfels.of(found, channels) if found else None

@@ -7,7 +7,7 @@ import math
 import torch
 
 from rtgs.gaussians.density import logit
-from rtgs.gaussians.materials import MaterialSurfels
+from rtgs.gaussians.materials import has_materials
 from rtgs.methods.base import StepEvent
 from rtgs.methods.surfel_set import SurfelSet
 from rtgs.train.specular_settings import PropagationSettings
@@ -21,8 +21,8 @@ def propagate_normals(base: SurfelSet, settings: PropagationSettings, generator:
     colour has baked in, so that reflection has something left to explain. Moments of what changed become 0.
     """
     surfels = base.surfels
-    assert isinstance(surfels, MaterialSurfels)
-    specular = surfels.specular_logits.sigmoid()
+    assert has_materials(surfels)
+    specular = surfels["specular_logits"].sigmoid()
     surfels.opacity_logits.clamp_(min=logit(settings.opacity))
     base.optimizer.zero_moments("opacity_logits")
     grown = specular >= settings.grow_border
@@ -41,6 +41,6 @@ def propagate_normals(base: SurfelSet, settings: PropagationSettings, generator:
 def reset_specular(base: SurfelSet, specular: float) -> None:
     """k_s becomes min(k_s, its initial value), as EnvGS does (3DGS-DR raises it instead); its moments become 0."""
     surfels = base.surfels
-    assert isinstance(surfels, MaterialSurfels)
-    surfels.specular_logits.clamp_(max=logit(specular))
+    assert has_materials(surfels)
+    surfels["specular_logits"].clamp_(max=logit(specular))
     base.optimizer.zero_moments("specular_logits")

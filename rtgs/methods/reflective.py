@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -10,11 +10,12 @@ from torch import Tensor
 
 from rtgs.core.cameras import Camera
 from rtgs.gaussians.materials import (
-    MaterialSurfels,
     activate_materials,
+    has_materials,
     with_materials,
     without_materials,
 )
+from rtgs.gaussians.primitives import PARAMETERS, Gaussians
 from rtgs.gaussians.surfels import Surfels
 from rtgs.methods.base import (
     Decision,
@@ -92,7 +93,7 @@ class ReflectiveMethod(SurfelMethod):
         return self._add_reflection() if stage.name == "reflection" else ()
 
     def _add_reflection(self) -> tuple[StepEvent, ...]:
-        self.base.adopt(with_materials(self.base.surfels, self.settings.materials))  # type: ignore[arg-type]
+        self.base.adopt(with_materials(self.base.surfels, self.settings.materials))
         settings = self.settings.reflection
         color = scene_color(settings.init_color, (view.image for view in self._views))
         surfels = reflection_surfels(settings, self._points, self.extent, self.generator, color)
@@ -139,12 +140,11 @@ class ReflectiveMethod(SurfelMethod):
     def base_features(self, colors: Tensor) -> Tensor:
         if self.reflection is None:
             return colors
-        assert isinstance(self.base.surfels, MaterialSurfels)
         return self.material_features(self.base.surfels, colors)
 
-    def material_features(self, surfels: MaterialSurfels, colors: Tensor) -> Tensor:
-        """(N, 5 + F) what is composited of surfels with materials: colours, k_s, roughness, f0."""
-        materials = activate_materials(surfels, self.settings.materials)
+    def material_features(self, surfels: Gaussians, colors: Tensor) -> Tensor:
+        """(N, 5 + F) what is composited of Gaussians with materials: colours, k_s, roughness, f0."""
+        materials = activate_materials(surfels)
         return torch.cat((colors, materials.specular[:, None], materials.roughness[:, None], materials.f0), dim=1)
 
     def see_through(
@@ -331,7 +331,7 @@ class ReflectiveMethod(SurfelMethod):
     def _drop(self, evidence: MatteEvidence) -> None:
         """Go on as in the first stage."""
         self.reflection = None
-        self.base.adopt(without_materials(self.base.surfels))  # type: ignore[arg-type]
+        self.base.adopt(without_materials(self.base.surfels))
         self._tell_matte(evidence)
 
     def _tell_matte(self, evidence: MatteEvidence) -> None:
@@ -371,13 +371,13 @@ class ReflectiveMethod(SurfelMethod):
 
     def load(self, state: dict[str, Tensor]) -> None:
         """Go on from :meth:`state` of either stage."""
-        if ("base.surfels.specular_logits" in state) != isinstance(self.base.surfels, MaterialSurfels):
-            plain = without_materials(self.base.surfels)  # type: ignore[arg-type]
+        if ("base.surfels.specular_logits" in state) != has_materials(self.base.surfels):
+            plain = without_materials(self.base.surfels)
             specular = "base.surfels.specular_logits" in state
             self.base.adopt(with_materials(plain, self.settings.materials) if specular else plain)
-        names = [field.name for field in fields(Surfels)]
-        rows = {name: state[f"reflection.surfels.{name}"] for name in names if f"reflection.surfels.{name}" in state}
-        self.reflection = self._new_set(Surfels(**{name: rows[name].clone() for name in names})) if rows else None
+        keys = {name: f"reflection.surfels.{name}" for name in PARAMETERS}
+        rows = {name: state[key].clone() for name, key in keys.items() if key in state}
+        self.reflection = self._new_set(Surfels.of(rows)) if rows else None
         super().load(state)
         if "matte" in state:
             self._tell_matte(MatteEvidence.of(state["matte"]))

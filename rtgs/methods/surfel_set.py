@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from rtgs.gaussians.activate import activate_surfels
-from rtgs.gaussians.adam import SurfelAdam
+from rtgs.gaussians.adam import GaussianAdam
 from rtgs.gaussians.density import DensityReport
 from rtgs.gaussians.mcmc import density_control
 from rtgs.gaussians.primitives import Gaussians
@@ -26,7 +25,7 @@ class Observation:
 
 
 class SurfelSet:
-    """Gaussians of one kind + :class:`SurfelAdam` + density control, kept consistent through every change of N.
+    """Gaussians of one kind + :class:`GaussianAdam` + density control, kept consistent through every change of N.
 
     ``name`` prefixes its tensors in a checkpoint and its lines in reports; ``extent`` is the scene's, world units.
     """
@@ -53,8 +52,8 @@ class SurfelSet:
     def __len__(self) -> int:
         return len(self.surfels)
 
-    def _new_optimizer(self) -> SurfelAdam:
-        return SurfelAdam(self.surfels, self._optimizer_settings, self.extent, means_lr_steps=self._means_lr_steps)
+    def _new_optimizer(self) -> GaussianAdam:
+        return GaussianAdam(self.surfels, self._optimizer_settings, self.extent, means_lr_steps=self._means_lr_steps)
 
     def activated(self, camera_center: Tensor, sh_degree: int) -> ActivatedSurfels:
         """Activated surfels as seen from ``camera_center`` (3,) world, SH up to ``sh_degree``."""
@@ -89,7 +88,7 @@ class SurfelSet:
             self.density.observe(self._observation.probe.grad, self._observation.weight_sum)
         self._observation = None
         for name in held:
-            getattr(self.surfels, name).grad = None  # Adam leaves a parameter without one alone
+            self.surfels[name].grad = None  # Adam leaves a parameter without one alone
         self.optimizer.step(step, sh_degree)
         self.optimizer.zero_grad()
         self._clamp()
@@ -109,19 +108,8 @@ class SurfelSet:
         """Lower every opacity to the settings' reset value."""
         self.density.reset_opacity(self.surfels, self.optimizer)
 
-    @torch.no_grad()
     def _clamp(self) -> None:
-        """Keep the activations finite whatever the learning rate (method.md 14).
-
-        exp overflows float32 at 88, and a logit beyond 13.8 has a sigmoid derivative below 1e-6 from which Adam cannot
-        return; the other parameters are used as they are, and Adam bounds their drift by learning rate times steps.
-        """
-        limits = self._optimizer_settings
-        smallest, largest = (math.log(share * self.extent) for share in (limits.smallest_scale, limits.largest_scale))
-        self.surfels.log_scales.clamp_(smallest, largest)
-        for name, values in self.surfels.items():
-            if name.endswith("_logits"):
-                values.clamp_(-limits.opacity_logit_limit, limits.opacity_logit_limit)
+        self.optimizer.clamp()
 
     def state(self) -> dict[str, Tensor]:
         """Every tensor of the set under dotted names."""
@@ -152,7 +140,7 @@ class SurfelSet:
                     f"the checkpoint has no {self.name}.surfels.{name}: it was written by another method or version; "
                     "train again from the start"
                 )
-            setattr(self.surfels, name, parameters[name].clone().requires_grad_())
+            self.surfels[name] = parameters[name].clone().requires_grad_()
         self.optimizer = self._new_optimizer()  # moments of the loaded number of surfels
         self.optimizer.load(part("adam"))
         self.density.load(part("density"))

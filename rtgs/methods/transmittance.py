@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from rtgs.core.cameras import Camera
-from rtgs.gaussians.materials import MaterialSurfels
 from rtgs.gaussians.surfels import ActivatedSurfels, Surfels
 from rtgs.mesh.container import ObjectSurfaces
 from rtgs.mesh.silhouettes import bounding
@@ -46,7 +45,6 @@ class TransmissiveMethod(GlassStage):
         if self.interface is None:
             return surfels, features
         own = self.interface.activated(camera.center.float(), self.sh_degree(step))
-        assert isinstance(self.interface.surfels, MaterialSurfels)
         own_features = self.material_features(self.interface.surfels, own.colors)
         names = [field.name for field in fields(ActivatedSurfels)]
         joined = {name: torch.cat((getattr(surfels, name), getattr(own, name))) for name in names}

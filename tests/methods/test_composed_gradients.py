@@ -41,7 +41,7 @@ def twin_render(method: ReflectiveMethod, base, reflection, camera, images) -> T
     """What ``method.render`` computes, from float64 copies of both sets, by the readable twins alone."""
     settings = method.settings
     surfels = activate(base, camera.center, method.sh_degree(STEP))
-    materials = activate_materials(base, settings.materials)
+    materials = activate_materials(base)
     features = torch.cat((surfels.colors, materials.specular[:, None], materials.roughness[:, None], materials.f0), 1)
     shape = (surfels.means, surfels.tangent_u, surfels.tangent_v, surfels.scales, surfels.opacities)
     options = method.raster_options(method.training_options(STEP), weight_sum=False)
@@ -89,7 +89,7 @@ def twin_render(method: ReflectiveMethod, base, reflection, camera, images) -> T
 def doubled(surfels):
     """A float64 copy that requires gradients."""
     values = {name: tensor.detach().double().requires_grad_() for name, tensor in surfels.items()}
-    return type(surfels)(**values)
+    return surfels.like(values)
 
 
 CASES = {
