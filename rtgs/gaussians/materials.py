@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -37,6 +38,16 @@ def material_channels(settings: MaterialSettings) -> tuple[Channel, Channel, Cha
         Channel(roughness, settings.roughness, curve, floor=settings.roughness_floor),
         Channel(f0, settings.f0, "sigmoid", shape=(settings.f0_channels,)),
     )
+
+
+def stored_materials(properties: Iterable[str]) -> tuple[Channel, ...]:
+    """The channels of materials, of default settings, where a PLY file with these properties has them all; else none."""
+    found = set(properties)
+    for columns in (3, 1):
+        channels = material_channels(MaterialSettings(f0_channels=columns))
+        if found.issuperset(name for channel in channels for name in channel.properties):
+            return channels
+    return ()
 
 
 def has_materials(gaussians: Gaussians) -> bool:

@@ -23,10 +23,9 @@ from rtgs.core.errors import RtgsError
 from rtgs.gaussians.channels import Channel
 from rtgs.gaussians.ellipsoids import Ellipsoids
 from rtgs.gaussians.harmonics import rgb_to_sh_dc
-from rtgs.gaussians.materials import material_channels
+from rtgs.gaussians.materials import stored_materials
 from rtgs.gaussians.primitives import Gaussians, tangents
 from rtgs.gaussians.surfels import Surfels
-from rtgs.train.specular_settings import MaterialSettings
 
 THIRD_LOG_SCALE = math.log(1e-6)  # what viewers get as the thickness of a surfel
 THICKEST_LOG_SCALE = -10.0  # a third scale above this is no surfel's
@@ -130,16 +129,8 @@ def read_gaussians(
         if channels:
             raise RtgsError(f"{path} is a compressed splat: it has no channel {channels[0].name}")
     else:
-        gaussians = _gaussians_of(path, vertices, names, _material_channels(names) if channels is None else channels)
+        gaussians = _gaussians_of(path, vertices, names, stored_materials(names) if channels is None else channels)
     return _without_broken(path, gaussians, skip_broken)
-
-
-def _material_channels(names: list[str]) -> tuple[Channel, ...]:
-    """The channels of materials where a file with properties of these names has all of them, else none."""
-    columns = sum(name.startswith("f0_") for name in names)
-    if columns not in (1, 3) or not {"specular", "roughness"} <= set(names):
-        return ()
-    return material_channels(MaterialSettings(f0_channels=columns))
 
 
 def _gaussians_of(

@@ -132,7 +132,7 @@ def test_image_and_every_gradient_are_those_of_the_twins(case: str):
     (rendered.image * upstream.float()).sum().backward()
     for part, exact in zip(method.sets, (base, reflection), strict=True):
         for name, tensor in part.surfels.items():
-            expected = getattr(exact, name).grad
+            expected = exact[name].grad
             if expected is None or float(expected.abs().max()) == 0:
                 assert tensor.grad is None or float(tensor.grad.abs().max()) < 1e-6, f"{part.name}.{name}"
                 continue
