@@ -41,7 +41,7 @@ def material_channels(settings: MaterialSettings) -> tuple[Channel, Channel, Cha
 
 
 def stored_materials(properties: Iterable[str]) -> tuple[Channel, ...]:
-    """The channels of materials, of default settings, where a PLY file with these properties has them all; else none."""
+    """The channels of materials, of default settings, where a PLY file with these properties has all of them."""
     found = set(properties)
     for columns in (3, 1):
         channels = material_channels(MaterialSettings(f0_channels=columns))
