@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import plyfile
 import pytest
@@ -21,7 +21,7 @@ from rtgs.gaussians.ellipsoids import Ellipsoids
 from rtgs.gaussians.initialize import gaussians_from_points
 from rtgs.gaussians.mcmc import McmcControl
 from rtgs.gaussians.ply import read_gaussians, write_ply
-from rtgs.gaussians.primitives import PARAMETERS
+from rtgs.gaussians.primitives import PARAMETERS, Gaussians
 from rtgs.gaussians.surfels import Surfels
 from rtgs.methods.surfel_set import SurfelSet
 from rtgs.train.settings import DensitySettings, InitSettings, OptimizerSettings
@@ -151,6 +151,11 @@ def test_a_set_refuses_what_it_cannot_hold():
 
 
 # ---- a set
+
+
+def test_parameters_are_the_fields_of_every_kind():
+    for kind in (Gaussians, Surfels, Ellipsoids):
+        assert tuple(field.name for field in fields(kind)) == (*PARAMETERS, "channels", "raw")
 
 
 @KINDS
