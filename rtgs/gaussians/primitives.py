@@ -46,6 +46,8 @@ class Gaussians:
             raise ValueError(f"values of the channels {', '.join(self.raw) or 'none'}, but declared are {declared}")
         for channel in self.channels:
             self._check_row(channel, self.raw[channel.name])
+            if (rows := len(self.raw[channel.name])) != len(self):
+                raise ValueError(f"channel {channel.name} has {rows} rows, but there are {len(self)} means")
 
     def __len__(self) -> int:
         return self.means.shape[0]
@@ -109,8 +111,10 @@ class Gaussians:
 
     def items(self) -> Iterator[tuple[str, Tensor]]:
         """(name, tensor) of every parameter, then of every channel, in the order of :attr:`names`."""
-        for name in self.names:
-            yield name, self[name]
+        for name in PARAMETERS:
+            yield name, getattr(self, name)
+        for channel in self.channels:
+            yield channel.name, self.raw[channel.name]
 
     @classmethod
     def of(cls, tensors: Mapping[str, Tensor], channels: tuple[Channel, ...] = ()) -> Self:

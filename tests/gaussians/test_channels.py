@@ -142,6 +142,8 @@ def test_a_set_refuses_what_it_cannot_hold():
     with pytest.raises(ValueError, match="values of the channels none, but declared are gloss_logits"):
         Surfels(*(plain[name] for name in PARAMETERS), channels=(GLOSS,))
     made = plain.with_channels(GLOSS, TINT)
+    with pytest.raises(ValueError, match="channel tint has 2 rows, but there are 3 means"):
+        made.like({**dict(made.items()), "tint": torch.zeros(2, 2)})
     with pytest.raises(ValueError, match=r"channel tint must be \(N, 2\), got \(3,\)"):
         made["tint"] = torch.zeros(3)
     with pytest.raises(KeyError, match=r"have no 'coat'; they have means, .*, gloss_logits, tint"):
