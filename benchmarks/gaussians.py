@@ -17,7 +17,7 @@ from pathlib import Path
 import torch
 
 from rtgs.gaussians.activate import activate_surfels
-from rtgs.gaussians.adam import SurfelAdam, find_nonfinite
+from rtgs.gaussians.adam import GaussianAdam, find_nonfinite
 from rtgs.gaussians.density import DensityControl
 from rtgs.gaussians.initialize import surfels_from_points
 from rtgs.gaussians.ply import read_ply, write_ply
@@ -67,8 +67,8 @@ def time_adam(surfels: Surfels, repeat: int) -> dict[str, float]:
     for _, values in surfels.items():
         values.grad = torch.randn(values.shape)
     settings = OptimizerSettings()
-    adam = SurfelAdam(surfels, settings, EXTENT)
-    first_degree = SurfelAdam(surfels, settings, EXTENT)
+    adam = GaussianAdam(surfels, settings, EXTENT)
+    first_degree = GaussianAdam(surfels, settings, EXTENT)
     fused = torch.optim.Adam([values for _, values in surfels.items()], lr=1e-4, eps=1e-15, fused=True)
     return {
         "adam": lowest_ms(lambda: adam.step(0), repeat),
@@ -87,7 +87,7 @@ def time_changes(count: int) -> dict[str, float]:
 
     def densify() -> None:
         some = surfels.detached().requires_grad_()
-        adam = SurfelAdam(some, OptimizerSettings(), EXTENT)
+        adam = GaussianAdam(some, OptimizerSettings(), EXTENT)
         fresh = DensityControl(DensitySettings(), EXTENT)
         fresh.observe(signal, weight)
         fresh.densify(some, adam, torch.Generator().manual_seed(0))

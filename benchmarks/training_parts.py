@@ -33,7 +33,7 @@ from benchmarks.training_runs import schedule_overrides
 if TYPE_CHECKING:
     from rtgs.config.schema import RunConfig
     from rtgs.mesh.container import ObjectMesh
-    from rtgs.methods import Method, Stage
+    from rtgs.methods import Stage
     from rtgs.methods.model import Model
     from rtgs.scenes.scene import Scene
 
@@ -121,7 +121,7 @@ class PartClock:
 def clocks(clock: PartClock) -> Iterator[None]:
     """Every part of a step under its clock."""
     from rtgs.gaussians import activate
-    from rtgs.gaussians.adam import SurfelAdam
+    from rtgs.gaussians.adam import GaussianAdam
     from rtgs.gaussians.density import DensityControl
     from rtgs.methods.model import Model
     from rtgs.methods.parts.gaussian_set import GaussianSet
@@ -144,7 +144,7 @@ def clocks(clock: PartClock) -> Iterator[None]:
     wanted += [
         (FollowingTree, "current", "tree"),
         (Model, "losses", "losses"),
-        (SurfelAdam, "step", "adam"),
+        (GaussianAdam, "step", "adam"),
         (GaussianSet, "_clamp", "adam"),
         (GaussianSet, "densify", "density"),
         (DensityControl, "observe", "density"),
@@ -242,7 +242,7 @@ def measure(words: Sequence[str], shrunk: Sequence[str], threads: int) -> Traini
     transparent = not why_unbounded([view.mask for view in scene.train])
     clock = time.thread_time if threads == 1 else time.perf_counter
 
-    def new(mesh: ObjectMesh | None = None) -> Method:
+    def new(mesh: ObjectMesh | None = None) -> Model:
         generator = generator_for(config.seed, "initialise")
         return create_method(config.method, scene, config.schedule, generator, mesh)
 

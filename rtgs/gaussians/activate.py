@@ -6,13 +6,11 @@ quaternion, mean at the camera centre, extreme logits and log-scales) are the sa
 
 from __future__ import annotations
 
-from dataclasses import fields
-
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from rtgs.gaussians.primitives import Gaussians
+from rtgs.gaussians.primitives import PARAMETERS, Gaussians
 from rtgs.gaussians.surfels import ActivatedSurfels
 from rtgs.native import core
 
@@ -29,14 +27,14 @@ def activate_surfels(surfels: Gaussians, camera_center: Tensor, sh_degree: int) 
         TypeError: a parameter is not float32 on the CPU.
         ValueError: shapes do not match.
     """
-    shared = [(field.name, getattr(surfels, field.name)) for field in fields(Gaussians)]  # a kind may have more
-    for name, tensor in shared:
+    for name in PARAMETERS:  # not the channels
+        tensor = surfels[name]
         if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
             raise TypeError(
                 f"surfels.{name} is {tensor.dtype} on {tensor.device}; activate_surfels takes float32 on the CPU "
                 "(rtgs.gaussians.surfels.activate takes any dtype)"
             )
-    raw = tuple(tensor for _, tensor in shared)
+    raw = tuple(surfels[name] for name in PARAMETERS)
     center = tuple(camera_center.tolist())
     outputs = _Activate.apply(center, min(sh_degree, surfels.sh_degree), *raw)
     return ActivatedSurfels(surfels.means, *outputs)
@@ -47,7 +45,7 @@ def activate_geometry(surfels: Gaussians) -> ActivatedSurfels:
 
     For the tracer, which evaluates colours itself, at the direction of each ray.
     """
-    raw = [getattr(surfels, field.name) for field in fields(Gaussians)]
+    raw = [surfels[name] for name in PARAMETERS]
     raw[4], raw[5] = raw[4].detach(), raw[5].new_empty(len(raw[5]), 0, 3)
     return ActivatedSurfels(surfels.means, *_Activate.apply((0.0, 0.0, 0.0), 0, *raw))
 

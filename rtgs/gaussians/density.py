@@ -1,7 +1,7 @@
-"""Density control: where surfels are cloned, split and pruned, and how a change of N reaches everything that has rows.
+"""Density control: where Gaussians are cloned, split and pruned, and how a change of N reaches all that has rows.
 
 The rules are those of 3DGS, 2DGS and EnvGS (method.md 6.1, 12), their differences are settings; ellipsoids meet the
-same ones as surfels. Each surfel meets at most one of them in a call, in this order: transparent -> pruned; too large
+same ones as surfels. Each Gaussian meets at most one of them in a call, in this order: transparent -> pruned; too large
 -> pruned or split into 5; high signal and large -> split into 2; high signal and small -> cloned. The cap on N comes
 last.
 """
@@ -15,7 +15,8 @@ from typing import Protocol, TypeVar
 import torch
 from torch import Tensor
 
-from rtgs.gaussians.adam import SurfelAdam
+from rtgs.gaussians.adam import GaussianAdam
+from rtgs.gaussians.channels import logit
 from rtgs.gaussians.primitives import Gaussians
 from rtgs.gaussians.settings import DensitySettings
 
@@ -24,57 +25,56 @@ Kind = TypeVar("Kind", bound=Gaussians)
 
 @dataclass(frozen=True)
 class DensityReport:
-    """What one call did, in surfels."""
+    """What one call did, in Gaussians."""
 
-    cloned: int  # surfels that got a copy
-    split: int  # surfels replaced by children
-    pruned: int  # surfels removed without children, those of the cap included
+    cloned: int  # that got a copy
+    split: int  # replaced by children
+    pruned: int  # removed without children, those of the cap included
     total: int  # N afterwards
 
 
 @dataclass(frozen=True)
 class RowPlan:
-    """A change of N: rows ``keep`` of the old surfels in this order, then the rows of ``added``."""
+    """A change of N: rows ``keep`` of the old Gaussians in this order, then the rows of ``added``."""
 
     keep: Tensor  # (M,) int64
-    added: Gaussians  # raw parameters of new surfels, no gradient
+    added: Gaussians  # raw parameters and channels of new rows, no gradient
 
 
 class HasRows(Protocol):
-    """Anything with one row a surfel: an optimiser's moments, statistics."""
+    """Anything with one row a Gaussian: an optimiser's moments, statistics."""
 
     def keep(self, index: Tensor) -> None: ...
 
     def append(self, count: int) -> None: ...
 
 
-def apply_plan(plan: RowPlan, surfels: Gaussians, *followers: HasRows) -> None:
-    """Change N of the surfels (in place: new leaf tensors, gradients dropped) and of all that has a row for each.
+def apply_plan(plan: RowPlan, gaussians: Gaussians, *followers: HasRows) -> None:
+    """Change N of the Gaussians (in place: new leaf tensors, gradients dropped) and of all that has a row for each.
 
     The only way N ever changes, so that parameters, moments and statistics cannot get out of step. Followers give new
     rows zeros.
     """
-    added = dict(plan.added.items())
-    for name, values in surfels.items():
-        merged = torch.cat((values.detach()[plan.keep], added[name].detach()))
-        setattr(surfels, name, merged.requires_grad_(values.requires_grad))
+    for name, values in gaussians.items():
+        merged = torch.cat((values.detach()[plan.keep], plan.added[name].detach()))
+        gaussians[name] = merged.requires_grad_(values.requires_grad)
     for follower in followers:
         follower.keep(plan.keep)
         follower.append(len(plan.added))
 
 
-def select_rows(surfels: Kind, index: Tensor) -> Kind:
+def select_rows(gaussians: Kind, index: Tensor) -> Kind:
     """A copy of rows ``index`` (int64 or bool), without gradient."""
-    return type(surfels)(**{name: values.detach()[index] for name, values in surfels.items()})
+    return gaussians.like({name: values.detach()[index] for name, values in gaussians.items()})
 
 
-def split_surfels(surfels: Kind, count: int, shrink: float, generator: torch.Generator) -> Kind:
+def split_gaussians(gaussians: Kind, count: int, shrink: float, generator: torch.Generator) -> Kind:
     """``count`` children of each Gaussian, drawn from it (a surfel: in its plane), with scales divided by ``shrink``.
 
     Returns:
-        N * count surfels; the children of one parent are neighbours. All else is inherited.
+        N * count Gaussians; the children of one parent are neighbours. All else is inherited, channels too.
     """
-    children = select_rows(surfels, torch.arange(len(surfels)).repeat_interleave(count))
+    children = select_rows(gaussians, torch.arange(len(gaussians)).repeat_interleave(count))
     normal = torch.randn(*children.log_scales.shape, generator=generator)
     children.means = children.means + (normal[..., None] * children.deviations()).sum(dim=1)
     children.log_scales = children.log_scales - math.log(shrink)
@@ -84,7 +84,7 @@ def split_surfels(surfels: Kind, count: int, shrink: float, generator: torch.Gen
 class DensityControl:
     """Statistics of the steps since the last change of N, and the rules that use them.
 
-    A surfel is visible in a step if its weight sum is positive or its signal is not zero; means are over those steps.
+    A Gaussian is visible in a step if its weight sum is positive or its signal is not zero; means are over those steps.
     """
 
     needs_signal = True  # of every training view
@@ -151,17 +151,17 @@ class DensityControl:
 
     @property
     def mean_signal(self) -> Tensor:
-        """(N,) mean norm of the signal over the steps a surfel was visible in; 0 if none."""
+        """(N,) mean norm of the signal over the steps a Gaussian was visible in; 0 if none."""
         return self.signal_sum / self.visible_steps.clamp_min(1)
 
     @property
     def mean_weight(self) -> Tensor:
-        """(N,) mean weight sum over the steps a surfel was visible in; 0 if none."""
+        """(N,) mean weight sum over the steps a Gaussian was visible in; 0 if none."""
         return self.weight_sum / self.visible_steps.clamp_min(1)
 
     @torch.no_grad()
     def densify(
-        self, surfels: Gaussians, optimizer: SurfelAdam, generator: torch.Generator, *, after_reset: bool = True
+        self, gaussians: Gaussians, optimizer: GaussianAdam, generator: torch.Generator, *, after_reset: bool = True
     ) -> DensityReport:
         """Clone, split and prune; the statistics start afresh. Without an observed step only pruning and splitting by
         opacity and size happen.
@@ -169,11 +169,11 @@ class DensityControl:
         ``after_reset``: opacities have been reset before (``settings.too_large_after_reset`` waits for that).
         """
         if not len(self.visible_steps):
-            self._clear(len(surfels))
+            self._clear(len(gaussians))
         s = self.settings
-        size = surfels.log_scales.detach().exp().amax(dim=1)
+        size = gaussians.log_scales.detach().exp().amax(dim=1)
         high_signal = (self.visible_steps > 0) & (self.mean_signal >= s.gradient_threshold)
-        transparent = surfels.opacity_logits.detach() < logit(s.min_opacity)
+        transparent = gaussians.opacity_logits.detach() < logit(s.min_opacity)
         too_large = torch.zeros_like(transparent)
         if s.too_large > 0 and (after_reset or not s.too_large_after_reset):
             too_large = ~transparent & (size > s.too_large * self.extent)
@@ -188,10 +188,10 @@ class DensityControl:
 
         keep = (~(transparent | too_large | split)).nonzero().flatten()
         parts = (
-            select_rows(surfels, clone),
-            split_surfels(select_rows(surfels, split), s.split_count, s.split_shrink, generator),
-            split_surfels(
-                select_rows(surfels, too_large_split), s.too_large_split_count, s.too_large_shrink, generator
+            select_rows(gaussians, clone),
+            split_gaussians(select_rows(gaussians, split), s.split_count, s.split_shrink, generator),
+            split_gaussians(
+                select_rows(gaussians, too_large_split), s.too_large_split_count, s.too_large_shrink, generator
             ),
         )
         weight = self.mean_weight
@@ -204,13 +204,13 @@ class DensityControl:
             )
         )
         plan, capped = self._capped(RowPlan(keep, concatenate(parts)), weights)
-        apply_plan(plan, surfels, optimizer, self)
+        apply_plan(plan, gaussians, optimizer, self)
         self._clear(0)
         return DensityReport(
             cloned=int(clone.sum()),
             split=int(split.sum() + too_large_split.sum()),
             pruned=int(transparent.sum() + too_large_pruned.sum()) + capped,
-            total=len(surfels),
+            total=len(gaussians),
         )
 
     @property
@@ -233,13 +233,13 @@ class DensityControl:
         kept = len(plan.keep)
         return RowPlan(plan.keep[stays[:kept]], select_rows(plan.added, stays[kept:])), excess
 
-    def perturb(self, surfels: Gaussians, means_rate: float, generator: torch.Generator) -> None:
+    def perturb(self, gaussians: Gaussians, means_rate: float, generator: torch.Generator) -> None:
         """What happens to the means after a step of Adam at ``means_rate``, world units: nothing."""
 
     @torch.no_grad()
-    def reset_opacity(self, surfels: Gaussians, optimizer: SurfelAdam) -> None:
+    def reset_opacity(self, gaussians: Gaussians, optimizer: GaussianAdam) -> None:
         """Opacity becomes min(opacity, ``settings.reset_opacity``); its moments become 0."""
-        surfels.opacity_logits.clamp_(max=logit(self.settings.reset_opacity))
+        gaussians.opacity_logits.clamp_(max=logit(self.settings.reset_opacity))
         optimizer.zero_moments("opacity_logits")
 
     def keep(self, index: Tensor) -> None:
@@ -291,9 +291,4 @@ def highest(chosen: Tensor, values: Tensor, count: int) -> Tensor:
 
 def concatenate(parts: tuple[Kind, ...]) -> Kind:
     """The rows of all parts, in order."""
-    return type(parts[0])(**{name: torch.cat([getattr(p, name) for p in parts]) for name, _ in parts[0].items()})
-
-
-def logit(opacity: float) -> float:
-    """The raw value of an opacity in (0, 1)."""
-    return math.log(opacity / (1 - opacity))
+    return parts[0].like({name: torch.cat([part[name] for part in parts]) for name in parts[0].names})

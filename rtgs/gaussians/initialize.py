@@ -11,6 +11,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from rtgs.core.errors import RtgsError
+from rtgs.gaussians.channels import Channel, logit
 from rtgs.gaussians.harmonics import rest_count, rgb_to_sh_dc
 from rtgs.gaussians.primitives import Gaussians
 from rtgs.gaussians.settings import InitSettings
@@ -41,6 +42,7 @@ def gaussians_from_points(
     generator: torch.Generator,
     *,
     box: Tensor | None = None,
+    channels: tuple[Channel, ...] = (),
 ) -> Kind:
     """One Gaussian for each point: round, scale from its neighbours, colour from the point, orientation random or none.
 
@@ -53,6 +55,7 @@ def gaussians_from_points(
         colors: (P, 3) in 0..1.
         generator: draws the orientations (and the random points).
         box: (2, 3) lowest and highest corner, world; only for random points.
+        channels: what the Gaussians hold besides, at their initial values.
 
     Returns:
         Gaussians that require gradients, float32.
@@ -84,14 +87,15 @@ def gaussians_from_points(
         quaternions = torch.rand(count, 4, generator=generator)
     else:
         quaternions = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1)
-    return kind(
+    made = kind(
         means=points.clone().contiguous(),
         log_scales=scale.log()[:, None].repeat(1, kind.axis_count),
         quaternions=quaternions,
-        opacity_logits=torch.full((count,), math.log(settings.opacity / (1 - settings.opacity))),
+        opacity_logits=torch.full((count,), logit(settings.opacity)),
         sh_dc=rgb_to_sh_dc(colors),
         sh_rest=torch.zeros(count, rest_count(settings.sh_degree), 3),
-    ).requires_grad_()
+    )
+    return made.with_channels(*channels).requires_grad_()
 
 
 def neighbor_distance(points: Tensor, neighbors: int) -> Tensor:

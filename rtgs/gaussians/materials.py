@@ -1,73 +1,74 @@
-"""Materials on surfels: what the second stage needs to know of a surface (method.md 2, 4.2, 4.4)."""
+"""Materials: the three channels that the second stage needs to know of a surface (method.md 2, 4.2, 4.4)."""
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, fields
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TypeVar
 
-import torch
 from torch import Tensor
 
-from rtgs.gaussians.density import logit
+from rtgs.gaussians.channels import Channel
+from rtgs.gaussians.primitives import Gaussians
 from rtgs.gaussians.settings import MaterialSettings
-from rtgs.gaussians.surfels import Surfels
 
-
-@dataclass
-class MaterialSurfels(Surfels):
-    """Surfels with a specular weight k_s, a roughness and a reflectance f0; raw parameters."""
-
-    specular_logits: Tensor  # (N,) k_s = sigmoid
-    roughness_logits: Tensor  # (N,) see :func:`activate_roughness`
-    f0_logits: Tensor  # (N, F) sigmoid; F = 1, or 3 for rgb
-
-
-MATERIAL_NAMES = tuple(field.name for field in fields(MaterialSurfels))[len(fields(Surfels)) :]
+MATERIAL_NAMES = ("specular_logits", "roughness_logits", "f0_logits")
+Kind = TypeVar("Kind", bound=Gaussians)
 
 
 @dataclass(frozen=True)
 class Materials:
-    """Activated materials of N surfels."""
+    """Activated materials of N Gaussians."""
 
     specular: Tensor  # (N,) k_s in (0, 1)
     roughness: Tensor  # (N,) in (floor, 1)
-    f0: Tensor  # (N, F) in (0, 1)
+    f0: Tensor  # (N, F) in (0, 1); F = 1, or 3 for rgb
 
 
-def with_materials(surfels: Surfels, settings: MaterialSettings) -> MaterialSurfels:
-    """The same surfels (the same tensors) with the materials that the settings start with."""
-    count = len(surfels)
-    shared = {field.name: getattr(surfels, field.name) for field in fields(Surfels)}
-    return MaterialSurfels(
-        **shared,
-        specular_logits=torch.full((count,), logit(settings.specular)),
-        roughness_logits=torch.full((count,), raw_roughness(settings.roughness, settings)),
-        f0_logits=torch.full((count, settings.f0_channels), logit(settings.f0)),
+def material_channels(settings: MaterialSettings) -> tuple[Channel, Channel, Channel]:
+    """A specular weight k_s, a roughness and a reflectance f0, at the initial values of the settings.
+
+    Roughness is floor^(1 - sigmoid), or floor + (1 - floor) sigmoid (method.md 4.2). Rates and bounds are those of
+    the optimiser's settings.
+    """
+    specular, roughness, f0 = MATERIAL_NAMES
+    curve = "linear_floor" if settings.roughness_curve == "linear" else "log_floor"
+    return (
+        Channel(specular, settings.specular, "sigmoid"),
+        Channel(roughness, settings.roughness, curve, floor=settings.roughness_floor),
+        Channel(f0, settings.f0, "sigmoid", shape=(settings.f0_channels,)),
     )
 
 
-def without_materials(surfels: Surfels) -> Surfels:
-    """The same surfels (the same tensors) as plain ones."""
-    return Surfels(**{field.name: getattr(surfels, field.name) for field in fields(Surfels)})
+def stored_materials(properties: Iterable[str]) -> tuple[Channel, ...]:
+    """The channels of materials, of default settings, where a PLY file with these properties has all of them."""
+    found = set(properties)
+    for columns in (3, 1):
+        channels = material_channels(MaterialSettings(f0_channels=columns))
+        if found.issuperset(name for channel in channels for name in channel.properties):
+            return channels
+    return ()
 
 
-def activate_materials(surfels: MaterialSurfels, settings: MaterialSettings) -> Materials:
-    """Materials of every surfel, differentiable by the raw parameters, any dtype."""
-    roughness = activate_roughness(surfels.roughness_logits, settings)
-    return Materials(surfels.specular_logits.sigmoid(), roughness, surfels.f0_logits.sigmoid())
+def has_materials(gaussians: Gaussians) -> bool:
+    """Whether all three material channels are there."""
+    return all(name in gaussians for name in MATERIAL_NAMES)
 
 
-def activate_roughness(raw: Tensor, settings: MaterialSettings) -> Tensor:
-    """Roughness between its floor and 1: floor^(1 - sigmoid), or floor + (1 - floor) sigmoid (method.md 4.2)."""
-    floor, share = settings.roughness_floor, raw.sigmoid()
-    if settings.roughness_curve == "linear":
-        return floor + (1 - floor) * share
-    return ((1 - share) * math.log(floor)).exp()
+def with_materials(gaussians: Kind, settings: MaterialSettings) -> Kind:
+    """The same Gaussians (the same tensors) with the materials that the settings start with."""
+    return gaussians.with_channels(*material_channels(settings))
 
 
-def raw_roughness(roughness: float, settings: MaterialSettings) -> float:
-    """The raw value of a roughness between the floor and 1."""
-    floor = settings.roughness_floor
-    if settings.roughness_curve == "linear":
-        return logit((roughness - floor) / (1 - floor))
-    return logit(1 - math.log(roughness) / math.log(floor))
+def without_materials(gaussians: Kind) -> Kind:
+    """The same Gaussians (the same tensors) without materials."""
+    return gaussians.without_channels(*MATERIAL_NAMES)
+
+
+def activate_materials(gaussians: Gaussians) -> Materials:
+    """Materials of every Gaussian, differentiable by the raw values, any dtype.
+
+    Raises:
+        KeyError: there are none.
+    """
+    return Materials(*(gaussians.activated(name) for name in MATERIAL_NAMES))

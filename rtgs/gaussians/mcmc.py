@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from rtgs.gaussians.adam import SurfelAdam
+from rtgs.gaussians.adam import GaussianAdam
 from rtgs.gaussians.density import DensityControl, DensityReport, RowPlan, apply_plan, select_rows
 from rtgs.gaussians.primitives import Gaussians
 from rtgs.gaussians.settings import DensitySettings
@@ -68,49 +68,49 @@ class McmcControl(DensityControl):
 
     @torch.no_grad()
     def densify(
-        self, surfels: Gaussians, optimizer: SurfelAdam, generator: torch.Generator, *, after_reset: bool = True
+        self, gaussians: Gaussians, optimizer: GaussianAdam, generator: torch.Generator, *, after_reset: bool = True
     ) -> DensityReport:
         """Move what is nearly transparent, and grow towards the budget.
 
         Places are drawn by opacity among the others. Whatever shares a place afterwards starts with zero moments. In
         the report, a Gaussian that moved counts as pruned here and cloned there.
         """
-        opacity = surfels.opacity_logits.detach().sigmoid()
+        opacity = gaussians.opacity_logits.detach().sigmoid()
         keep = (opacity >= self.settings.mcmc.min_opacity).nonzero().flatten()
         if len(keep) > self.cap:
             keep = opacity.argsort(descending=True, stable=True)[: self.cap].sort().values
-        pruned = len(surfels) - len(keep)
-        target = min(int((1 + self.settings.mcmc.growth) * len(surfels)), self.cap)
+        pruned = len(gaussians) - len(keep)
+        target = min(int((1 + self.settings.mcmc.growth) * len(gaussians)), self.cap)
         added = draw_copies(opacity[keep], target - len(keep), generator)
         source = keep[added > 0]
-        self._share(surfels, source, 1 + added[added > 0])
-        for name, _ in surfels.items():
+        self._share(gaussians, source, 1 + added[added > 0])
+        for name in gaussians.names:
             optimizer.zero_moments(name, source)
-        plan = RowPlan(keep, select_rows(surfels, keep.repeat_interleave(added)))
-        apply_plan(plan, surfels, optimizer, self)
-        return DensityReport(cloned=len(plan.added), split=0, pruned=pruned, total=len(surfels))
+        plan = RowPlan(keep, select_rows(gaussians, keep.repeat_interleave(added)))
+        apply_plan(plan, gaussians, optimizer, self)
+        return DensityReport(cloned=len(plan.added), split=0, pruned=pruned, total=len(gaussians))
 
-    def _share(self, surfels: Gaussians, rows: Tensor, copies: Tensor) -> None:
+    def _share(self, gaussians: Gaussians, rows: Tensor, copies: Tensor) -> None:
         """Give ``rows`` the opacity and scales that each of ``copies`` equal Gaussians has at their place."""
-        opacity = surfels.opacity_logits.detach()[rows].double().sigmoid()
+        opacity = gaussians.opacity_logits.detach()[rows].double().sigmoid()
         shared = shared_opacity(opacity, copies).clamp_min(self.settings.mcmc.min_opacity)  # not dead again at once
-        surfels.opacity_logits[rows] = torch.logit(shared).float()
-        surfels.log_scales[rows] += shared_shrink(opacity, copies).log().float()[:, None]
+        gaussians.opacity_logits[rows] = torch.logit(shared).float()
+        gaussians.log_scales[rows] += shared_shrink(opacity, copies).log().float()[:, None]
 
     @torch.no_grad()
-    def perturb(self, surfels: Gaussians, means_rate: float, generator: torch.Generator) -> None:
+    def perturb(self, gaussians: Gaussians, means_rate: float, generator: torch.Generator) -> None:
         """Langevin noise on the means: covariance times standard normal, full strength only where nearly transparent.
 
         The covariance is taken in units of the scene extent, so that a scene in other units is trained alike.
         """
         mcmc = self.settings.mcmc
-        strength = torch.sigmoid(mcmc.noise_sharpness * (mcmc.noise_border - surfels.opacity_logits.sigmoid()))
+        strength = torch.sigmoid(mcmc.noise_sharpness * (mcmc.noise_border - gaussians.opacity_logits.sigmoid()))
         rows = (strength > SLIGHTEST_NOISE).nonzero().flatten()
         normal = torch.randn(len(rows), 3, generator=generator)
-        deviations = select_rows(surfels, rows).deviations() / self.extent
+        deviations = select_rows(gaussians, rows).deviations() / self.extent
         along = (deviations * normal[:, None]).sum(dim=2, keepdim=True)  # covariance = sum of outer products
         noise = (along * deviations).sum(dim=1)
-        surfels.means[rows] += means_rate * mcmc.noise * strength[rows, None] * noise
+        gaussians.means[rows] += means_rate * mcmc.noise * strength[rows, None] * noise
 
 
 def draw_copies(opacity: Tensor, count: int, generator: torch.Generator) -> Tensor:

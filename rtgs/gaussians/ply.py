@@ -4,7 +4,8 @@ Float32 vertex properties: x y z nx ny nz f_dc_0..2 f_rest_0..3K-1 opacity scale
 are raw (logit of opacity, log of scales, quaternion w x y z of any length); f_rest is channel-major: all
 coefficients of red, then green, then blue. Of other tools' files the same names are read, in any order, whatever else
 they hold; PlayCanvas' compressed files are read with ``gsply``.
-Surfels with materials have specular roughness f0_0.. besides, raw too; viewers ignore them.
+Channels follow, raw too, under the names of ``Channel.properties`` (materials: specular roughness f0_0..); viewers
+ignore them.
 """
 
 from __future__ import annotations
@@ -19,9 +20,10 @@ import torch
 from torch import Tensor
 
 from rtgs.core.errors import RtgsError
+from rtgs.gaussians.channels import Channel
 from rtgs.gaussians.ellipsoids import Ellipsoids
 from rtgs.gaussians.harmonics import rgb_to_sh_dc
-from rtgs.gaussians.materials import MaterialSurfels
+from rtgs.gaussians.materials import stored_materials
 from rtgs.gaussians.primitives import Gaussians, tangents
 from rtgs.gaussians.surfels import Surfels
 
@@ -30,7 +32,7 @@ THICKEST_LOG_SCALE = -10.0  # a third scale above this is no surfel's
 COMMENT = "surfels (2D Gaussians): scale_0, scale_1 along columns 0, 1 of the rotation"
 
 
-def write_ply(path: str | Path, surfels: Gaussians, third_scale: bool = True) -> None:
+def write_ply(path: str | Path, gaussians: Gaussians, third_scale: bool = True) -> None:
     """Write N surfels or ellipsoids, binary little-endian; an existing file is replaced in one step.
 
     Ellipsoids have their three scales and normals of 0, as 3DGS writes them.
@@ -40,14 +42,14 @@ def write_ply(path: str | Path, surfels: Gaussians, third_scale: bool = True) ->
             file is the native two-scale one. :func:`read_gaussians` takes all of them and gives back the same bits.
 
     Raises:
-        ValueError: a parameter holds NaN or inf.
+        ValueError: a value is NaN or inf, or a channel has the name of another property.
     """
     path = Path(path)
-    values = {name: tensor.detach() for name, tensor in surfels.items()}
+    values = {name: tensor.detach() for name, tensor in gaussians.items()}
     for name, tensor in values.items():
         if bad := int((~torch.isfinite(tensor)).sum()):
             raise ValueError(f"{path} is not written: {bad} values of {name} are NaN or inf")
-    flat = surfels.axis_count == 2
+    flat = gaussians.axis_count == 2
     normals = torch.zeros_like(values["means"])
     if flat:
         normals = torch.linalg.cross(*tangents(values["quaternions"]), dim=1)
@@ -58,15 +60,16 @@ def write_ply(path: str | Path, surfels: Gaussians, third_scale: bool = True) ->
     rest = values["sh_rest"].transpose(1, 2).flatten(1)
     _add(columns, _numbered("f_rest", rest.shape[1]), rest)
     columns["opacity"] = values["opacity_logits"]
-    _add(columns, _numbered("scale", surfels.axis_count), values["log_scales"])
+    _add(columns, _numbered("scale", gaussians.axis_count), values["log_scales"])
     if flat and third_scale:
-        columns["scale_2"] = torch.full((len(surfels),), THIRD_LOG_SCALE)
+        columns["scale_2"] = torch.full((len(gaussians),), THIRD_LOG_SCALE)
     _add(columns, _numbered("rot", 4), values["quaternions"])
-    if isinstance(surfels, MaterialSurfels):
-        columns["specular"], columns["roughness"] = values["specular_logits"], values["roughness_logits"]
-        _add(columns, _numbered("f0", values["f0_logits"].shape[1]), values["f0_logits"])
+    for channel in gaussians.channels:
+        if taken := [name for name in channel.properties if name in columns]:
+            raise ValueError(f"{path} is not written: channel {channel.name} would be property {taken[0]}, as another")
+        _add(columns, channel.properties, values[channel.name].reshape(len(gaussians), channel.columns))
 
-    vertices = np.empty(len(surfels), dtype=[(name, "<f4") for name in columns])
+    vertices = np.empty(len(gaussians), dtype=[(name, "<f4") for name in columns])
     for name, column in columns.items():
         vertices[name] = column.numpy()
     element = plyfile.PlyElement.describe(vertices, "vertex")
@@ -78,14 +81,17 @@ def write_ply(path: str | Path, surfels: Gaussians, third_scale: bool = True) ->
         partial.unlink(missing_ok=True)
 
 
-def read_ply(path: str | Path) -> Surfels:
+def read_ply(path: str | Path, *, channels: tuple[Channel, ...] | None = None) -> Surfels:
     """Read surfels from a file of :func:`write_ply`, of 2DGS or of another tool with this layout (text or binary).
+
+    Args:
+        channels: as of :func:`read_gaussians`.
 
     Raises:
         FileNotFoundError: there is no such file.
         RtgsError: as :func:`read_gaussians`, or the Gaussians are not flat.
     """
-    gaussians = read_gaussians(path)
+    gaussians = read_gaussians(path, channels=channels)
     if not isinstance(gaussians, Surfels):
         thick = int((gaussians.log_scales[:, 2] > THICKEST_LOG_SCALE).sum())
         raise RtgsError(
@@ -95,17 +101,21 @@ def read_ply(path: str | Path) -> Surfels:
     return gaussians
 
 
-def read_gaussians(path: str | Path, *, skip_broken: bool = False) -> Surfels | Ellipsoids:
+def read_gaussians(
+    path: str | Path, *, skip_broken: bool = False, channels: tuple[Channel, ...] | None = None
+) -> Surfels | Ellipsoids:
     """Read any Gaussian splat in the layout of 3DGS: text or binary, plain or compressed, SH of degree 0 to 3.
 
     Properties may come in any order; those without a meaning here, the normals among them, are ignored.
 
     Args:
         skip_broken: leave out Gaussians with a NaN or inf instead of refusing the file.
+        channels: those to read; the file holds raw values, but not what they mean. None: materials where it has them,
+            with the activations of default settings.
 
     Returns:
         Surfels where there is no third scale, or all third scales are below exp(-10) world units; else ellipsoids.
-        Float32, without gradient. :class:`MaterialSurfels` where the file has materials.
+        Float32, without gradient.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -116,13 +126,17 @@ def read_gaussians(path: str | Path, *, skip_broken: bool = False) -> Surfels | 
     names = [p.name for p in vertices.properties if not isinstance(p, plyfile.PlyListProperty)]
     if "packed_position" in names:
         gaussians = _read_compressed(path)
+        if channels:
+            raise RtgsError(f"{path} is a compressed splat: it has no channel {channels[0].name}")
     else:
-        gaussians = _gaussians_of(path, vertices, names)
+        gaussians = _gaussians_of(path, vertices, names, stored_materials(names) if channels is None else channels)
     return _without_broken(path, gaussians, skip_broken)
 
 
-def _gaussians_of(path: Path, vertices: plyfile.PlyElement, names: list[str]) -> Surfels | Ellipsoids:
-    """The raw parameters of a plain file."""
+def _gaussians_of(
+    path: Path, vertices: plyfile.PlyElement, names: list[str], channels: tuple[Channel, ...]
+) -> Surfels | Ellipsoids:
+    """The raw parameters of a plain file, and its channels."""
     rest_count = sum(name.startswith("f_rest_") for name in names)
     if rest_count not in (0, 9, 24, 45):
         raise RtgsError(f"{path}: {rest_count} properties f_rest_*; SH of degree 0, 1, 2, 3 has 0, 9, 24, 45")
@@ -146,22 +160,15 @@ def _gaussians_of(path: Path, vertices: plyfile.PlyElement, names: list[str]) ->
         sh_dc = rgb_to_sh_dc(columns("red", "green", "blue") / 255)  # nerfstudio's export with ply_color_mode=rgb
     else:
         sh_dc = columns(*_numbered("f_dc", 3))
-    gaussians = kind(
+    return kind(
         means=columns("x", "y", "z"),
         log_scales=columns(*_numbered("scale", kind.axis_count)),
         quaternions=columns(*_numbered("rot", 4)),
         opacity_logits=columns("opacity").flatten(),
         sh_dc=sh_dc,
         sh_rest=rest.transpose(1, 2).contiguous(),
-    )
-    if "specular" not in names or not isinstance(gaussians, Surfels):
-        return gaussians
-    channels = sum(name.startswith("f0_") for name in names)
-    return MaterialSurfels(
-        **dict(gaussians.items()),
-        specular_logits=columns("specular").flatten(),
-        roughness_logits=columns("roughness").flatten(),
-        f0_logits=columns(*_numbered("f0", channels)),
+        channels=channels,
+        raw={c.name: columns(*c.properties).reshape(vertices.count, *c.shape) for c in channels},
     )
 
 
@@ -209,7 +216,7 @@ def _without_broken(path: Path, gaussians: Surfels | Ellipsoids, skip_broken: bo
             f"{path}: NaN or inf in {', '.join(where)} of {len(bad)} of {len(gaussians)} vertices, the first {bad[0]}; "
             "skip_broken (--skip-broken) leaves them out"
         )
-    return type(gaussians)(**{name: values[finite] for name, values in gaussians.items()})
+    return gaussians.like({name: values[finite] for name, values in gaussians.items()})
 
 
 def _add(columns: dict[str, Tensor], names: tuple[str, ...], values: Tensor) -> None:

@@ -1,22 +1,32 @@
 """What surfels and ellipsoids have in common: a structure of arrays of raw parameters, one row a Gaussian.
 
-Optimiser, density control, checkpoints and sets go by these names and row counts; a kind of Gaussian adds its shape,
-and may add parameters of its own (each needs a learning rate of its name in ``method.optimizer``).
+Optimiser, density control, checkpoints and sets go by these names and row counts. A kind of Gaussian adds its shape;
+any kind may hold channels besides (``rtgs.gaussians.channels``).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from typing import ClassVar, Self
 
 import torch
 from torch import Tensor
 
+from rtgs.gaussians.channels import Channel, check_channels
+
+PARAMETERS = ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest")  # what every Gaussian has
+
 
 @dataclass
 class Gaussians:
-    """N Gaussians. Raw (unconstrained) parameters (method.md 2)."""
+    """N Gaussians. Raw (unconstrained) parameters (method.md 2), and channels by name.
+
+    ``gaussians["means"]`` is the tensor of that name, of a parameter or of a channel.
+
+    Raises:
+        ValueError: ``raw`` does not hold exactly the declared ``channels``, or they do not fit together.
+    """
 
     axis_count: ClassVar[int]  # S: scales a Gaussian has
 
@@ -26,14 +36,109 @@ class Gaussians:
     opacity_logits: Tensor  # (N,)
     sh_dc: Tensor  # (N, 3) degree-0 SH coefficients; colour = max(0, 0.5 + sum SH)
     sh_rest: Tensor  # (N, K, 3), K = (degree + 1)^2 - 1 in {0, 3, 8, 15}
+    channels: tuple[Channel, ...] = ()  # in the order in which they are composited
+    raw: dict[str, Tensor] = field(default_factory=dict)  # of each channel (N, *its shape)
+
+    def __post_init__(self) -> None:
+        check_channels(self.channels, PARAMETERS)
+        if self.raw.keys() != {channel.name for channel in self.channels}:
+            declared = ", ".join(channel.name for channel in self.channels) or "none"
+            raise ValueError(f"values of the channels {', '.join(self.raw) or 'none'}, but declared are {declared}")
+        for channel in self.channels:
+            self._check_row(channel, self.raw[channel.name])
+            if (rows := len(self.raw[channel.name])) != len(self):
+                raise ValueError(f"channel {channel.name} has {rows} rows, but there are {len(self)} means")
 
     def __len__(self) -> int:
         return self.means.shape[0]
 
+    def __contains__(self, name: str) -> bool:
+        return name in PARAMETERS or name in self.raw
+
+    def __getitem__(self, name: str) -> Tensor:
+        """The raw tensor of a parameter or a channel.
+
+        Raises:
+            KeyError: there is none of this name.
+        """
+        self._check_name(name)
+        return getattr(self, name) if name in PARAMETERS else self.raw[name]
+
+    def __setitem__(self, name: str, tensor: Tensor) -> None:
+        """Another tensor for a parameter or a channel that is there; whoever changes N sets all of them.
+
+        Raises:
+            KeyError: there is none of this name.
+            ValueError: rows of a channel have another shape.
+        """
+        self._check_name(name)
+        if name in PARAMETERS:
+            setattr(self, name, tensor)
+        else:
+            self._check_row(self.channel(name), tensor)
+            self.raw[name] = tensor
+
+    def _check_name(self, name: str) -> None:
+        if name not in self:
+            raise KeyError(f"{type(self).__name__} have no {name!r}; they have {', '.join(self.names)}")
+
+    @staticmethod
+    def _check_row(channel: Channel, tensor: Tensor) -> None:
+        if tuple(tensor.shape[1:]) != channel.shape or not tensor.ndim:
+            expected = ", ".join(("N", *map(str, channel.shape)))
+            raise ValueError(f"channel {channel.name} must be ({expected}), got {tuple(tensor.shape)}")
+
+    def channel(self, name: str) -> Channel:
+        """The declared channel of this name.
+
+        Raises:
+            KeyError: there is none.
+        """
+        for channel in self.channels:
+            if channel.name == name:
+                return channel
+        held = ", ".join(channel.name for channel in self.channels) or "none"
+        raise KeyError(f"{type(self).__name__} have no channel {name!r}; they have {held}")
+
+    def activated(self, name: str) -> Tensor:
+        """(N, *shape) activated values of a channel, differentiable."""
+        return self.channel(name).activate(self[name])
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the parameters, then of the channels as declared."""
+        return (*PARAMETERS, *(channel.name for channel in self.channels))
+
     def items(self) -> Iterator[tuple[str, Tensor]]:
-        """(name, tensor) of every parameter, in a fixed order."""
-        for field in fields(self):
-            yield field.name, getattr(self, field.name)
+        """(name, tensor) of every parameter, then of every channel, in the order of :attr:`names`."""
+        for name in PARAMETERS:
+            yield name, getattr(self, name)
+        for channel in self.channels:
+            yield channel.name, self.raw[channel.name]
+
+    @classmethod
+    def of(cls, tensors: Mapping[str, Tensor], channels: tuple[Channel, ...] = ()) -> Self:
+        """Gaussians of named tensors (names of others are left out).
+
+        Raises:
+            KeyError: a parameter or a channel is missing.
+        """
+        parameters = {name: tensors[name] for name in PARAMETERS}
+        return cls(**parameters, channels=channels, raw={channel.name: tensors[channel.name] for channel in channels})
+
+    def like(self, tensors: Mapping[str, Tensor]) -> Self:
+        """The same kind with the same channels, of other tensors: one for each of :attr:`names`."""
+        return type(self).of(tensors, self.channels)
+
+    def with_channels(self, *channels: Channel) -> Self:
+        """The same Gaussians (the same tensors) with these channels besides, at their initial values."""
+        rows = {channel.name: channel.initial_rows(len(self), self.means.dtype) for channel in channels}
+        return type(self).of({**rows, **dict(self.items())}, (*self.channels, *channels))
+
+    def without_channels(self, *names: str) -> Self:
+        """The same Gaussians (the same tensors) without the channels of these names, as far as they are there."""
+        kept = tuple(channel for channel in self.channels if channel.name not in names)
+        return type(self).of(dict(self.items()), kept)
 
     @property
     def sh_degree(self) -> int:
@@ -47,7 +152,7 @@ class Gaussians:
 
     def detached(self) -> Self:
         """A copy that shares no memory and no graph."""
-        return type(self)(**{name: tensor.detach().clone() for name, tensor in self.items()})
+        return self.like({name: tensor.detach().clone() for name, tensor in self.items()})
 
     def axes(self) -> Tensor:
         """(N, S, 3) unit axes of the Gaussian, world: one for each scale."""

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from rtgs.core.cameras import Camera
+from rtgs.gaussians.channels import MAX_CHANNELS
 from rtgs.gaussians.harmonics import MAX_DEGREE, rest_count
 from rtgs.render.buffers import TraceOptions
 
-MAX_CHANNELS = 32
 MAX_SIDE = 1 << 18  # pixels: the kernels' tile numbers are 16-bit
 
 

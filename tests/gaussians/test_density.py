@@ -9,8 +9,16 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rtgs.gaussians.adam import SurfelAdam
-from rtgs.gaussians.density import DensityControl, DensityReport, RowPlan, apply_plan, logit, select_rows, split_surfels
+from rtgs.gaussians.adam import GaussianAdam
+from rtgs.gaussians.density import (
+    DensityControl,
+    DensityReport,
+    RowPlan,
+    apply_plan,
+    logit,
+    select_rows,
+    split_gaussians,
+)
 from rtgs.gaussians.settings import DensitySettings, OptimizerSettings
 from rtgs.gaussians.surfels import Surfels, tangents
 
@@ -19,7 +27,7 @@ SMALL, LARGE, TOO_LARGE = 0.01, 0.1, 0.5
 HOT, COLD = 1e-3, 1e-5
 
 
-def scene(sizes: list[float], opacities: list[float] | None = None) -> tuple[Surfels, SurfelAdam]:
+def scene(sizes: list[float], opacities: list[float] | None = None) -> tuple[Surfels, GaussianAdam]:
     """Surfels whose rows, and the rows of whose moments, carry their number as a marker."""
     count = len(sizes)
     marker = torch.arange(1.0, count + 1)
@@ -33,7 +41,7 @@ def scene(sizes: list[float], opacities: list[float] | None = None) -> tuple[Sur
         sh_dc=marker[:, None].repeat(1, 3),
         sh_rest=marker[:, None, None].repeat(1, 15, 3),
     ).requires_grad_()
-    adam = SurfelAdam(surfels, OptimizerSettings(), EXTENT)
+    adam = GaussianAdam(surfels, OptimizerSettings(), EXTENT)
     for moments, factor in ((adam.first, 10), (adam.second, 100)):
         for _, values in moments.items():
             values += (factor * marker).reshape(-1, *[1] * (values.ndim - 1))
@@ -47,11 +55,11 @@ def control_of(signals: list[float], weights: list[float] | None = None, **chang
     return control
 
 
-def run(surfels: Surfels, adam: SurfelAdam, control: DensityControl, seed: int = 0) -> DensityReport:
+def run(surfels: Surfels, adam: GaussianAdam, control: DensityControl, seed: int = 0) -> DensityReport:
     return control.densify(surfels, adam, torch.Generator().manual_seed(seed))
 
 
-def assert_in_step(surfels: Surfels, adam: SurfelAdam, kept: list[int], added: list[int]) -> None:
+def assert_in_step(surfels: Surfels, adam: GaussianAdam, kept: list[int], added: list[int]) -> None:
     """Rows kept have their own moments, rows added have none; all rows descend from the marked parents."""
     assert surfels.sh_dc[:, 0].tolist() == kept + added
     assert surfels.sh_rest[:, 14, 2].tolist() == kept + added
@@ -178,7 +186,7 @@ def test_without_observations_only_transparent_and_too_large_change():
 
 def test_split_children_lie_in_the_plane_with_the_spread_of_the_parent():
     surfels, _ = scene([0.4])
-    children = split_surfels(surfels, 4000, 1.6, torch.Generator().manual_seed(3))
+    children = split_gaussians(surfels, 4000, 1.6, torch.Generator().manual_seed(3))
     tangent_u, tangent_v = tangents(surfels.quaternions.detach())
     offset = children.means - surfels.means.detach()
     along = torch.stack(((offset * tangent_u).sum(1), (offset * tangent_v).sum(1)), 1)

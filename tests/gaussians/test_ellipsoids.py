@@ -1,17 +1,14 @@
-"""What sets of any kind of Gaussian share: axes, samples, splitting in three dimensions, parameters of their own."""
+"""What sets of any kind of Gaussian share: axes, samples, splitting in three dimensions."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import pytest
 import torch
 from surfel_cases import random_surfels
 from torch import Tensor
 
-from rtgs.gaussians.activate import activate_surfels
-from rtgs.gaussians.adam import SurfelAdam
-from rtgs.gaussians.density import DensityControl, RowPlan, apply_plan, select_rows, split_surfels
+from rtgs.gaussians.adam import GaussianAdam
+from rtgs.gaussians.density import DensityControl, split_gaussians
 from rtgs.gaussians.ellipsoids import Ellipsoids
 from rtgs.gaussians.primitives import Gaussians
 from rtgs.gaussians.settings import DensitySettings, OptimizerSettings
@@ -35,7 +32,7 @@ def test_axes_are_the_columns_of_a_rotation():
 @pytest.mark.parametrize("kind", [Surfels, Ellipsoids])
 def test_children_are_samples_of_the_parent(kind):
     parent = random_surfels(1, kind=kind).detached()
-    children = split_surfels(parent, 40_000, 1.6, torch.Generator().manual_seed(0))
+    children = split_gaussians(parent, 40_000, 1.6, torch.Generator().manual_seed(0))
     assert type(children) is kind
     offsets = children.means - parent.means
     expected = covariance(parent)[0]
@@ -46,7 +43,7 @@ def test_children_are_samples_of_the_parent(kind):
 
 def test_ellipsoids_keep_their_kind_through_density_control():
     ellipsoids = random_surfels(30, kind=Ellipsoids)
-    adam = SurfelAdam(ellipsoids, OptimizerSettings(), extent=100.0)
+    adam = GaussianAdam(ellipsoids, OptimizerSettings(), extent=100.0)
     control = DensityControl(DensitySettings(), extent=100.0)
     control.observe(torch.full((30, 2), 1e-3), torch.ones(30))
     report = control.densify(ellipsoids, adam, torch.Generator().manual_seed(0))
@@ -54,29 +51,3 @@ def test_ellipsoids_keep_their_kind_through_density_control():
     for moments in (adam.first, adam.second):
         assert type(moments) is Ellipsoids
         assert [tensor.shape for _, tensor in moments.items()] == [tensor.shape for _, tensor in ellipsoids.items()]
-
-
-@dataclass
-class Coated(Surfels):
-    """Surfels with a parameter of their own."""
-
-    coat: Tensor  # (N,)
-
-
-@dataclass(frozen=True)
-class CoatedRates(OptimizerSettings):
-    coat: float = 0.5
-
-
-def test_a_parameter_of_ones_own_travels_with_the_rest():
-    plain = random_surfels(20).detached()
-    coated = Coated(**dict(plain.items()), coat=torch.arange(20.0)).requires_grad_()
-    with pytest.raises(ValueError, match="Coated has parameters without a learning rate: coat"):
-        SurfelAdam(coated, OptimizerSettings(), 1.0)
-    adam = SurfelAdam(coated, CoatedRates(), 1.0)
-    (activate_surfels(coated, torch.zeros(3), 3).colors.sum() + coated.coat.sum()).backward()
-    adam.step(0)
-    torch.testing.assert_close(coated.coat.detach(), torch.arange(20.0) - 0.5)
-    apply_plan(RowPlan(torch.arange(5, 20), select_rows(coated, torch.tensor([3]))), coated, adam)
-    torch.testing.assert_close(coated.coat.detach(), torch.tensor([*range(5, 20), 3.0]) - 0.5)
-    assert adam.first.coat.shape == (16,)

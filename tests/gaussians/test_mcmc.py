@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from surfel_cases import random_surfels
 
 from rtgs.core.cameras import Camera
-from rtgs.gaussians.adam import SurfelAdam
+from rtgs.gaussians.adam import GaussianAdam
 from rtgs.gaussians.density import DensityControl
 from rtgs.gaussians.ellipsoids import Ellipsoids
 from rtgs.gaussians.mcmc import McmcControl, density_control, draw_copies, shared_opacity, shared_shrink
@@ -67,7 +67,7 @@ def test_growth_keeps_the_picture():
     before = picture(one)
     grown = one.detached().requires_grad_()
     settings = replace(MCMC, mcmc=McmcSettings(growth=2.0))
-    report = McmcControl(settings, 1.0).densify(grown, SurfelAdam(grown, OptimizerSettings(), 1.0), generator())
+    report = McmcControl(settings, 1.0).densify(grown, GaussianAdam(grown, OptimizerSettings(), 1.0), generator())
     assert (report.total, report.cloned, report.pruned) == (3, 2, 0)
     after = picture(grown.detached())
     plain = Ellipsoids(**{name: values.repeat(3, *[1] * (values.ndim - 1)) for name, values in one.items()})
@@ -78,11 +78,11 @@ def test_growth_keeps_the_picture():
     assert float(error.mean()) < 0.15 * float(uncorrected.mean())
 
 
-def state(count: int, opacities: torch.Tensor, kind=Ellipsoids) -> tuple[Surfels | Ellipsoids, SurfelAdam]:
+def state(count: int, opacities: torch.Tensor, kind=Ellipsoids) -> tuple[Surfels | Ellipsoids, GaussianAdam]:
     gaussians = random_surfels(count, kind=kind)
     with torch.no_grad():
         gaussians.opacity_logits.copy_(torch.logit(opacities))
-    adam = SurfelAdam(gaussians, OptimizerSettings(), 1.0)
+    adam = GaussianAdam(gaussians, OptimizerSettings(), 1.0)
     for moments in (adam.first, adam.second):
         for _, values in moments.items():
             values += 1

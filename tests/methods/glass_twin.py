@@ -9,7 +9,7 @@ from reflective_cases import training_maps
 from torch import Tensor
 
 from rtgs.core.cameras import Camera
-from rtgs.gaussians.materials import MaterialSurfels, activate_materials
+from rtgs.gaussians.materials import activate_materials
 from rtgs.gaussians.surfels import ActivatedSurfels, Surfels, activate
 from rtgs.methods.model import Model
 from rtgs.methods.parts.kinds import surfel_options
@@ -33,7 +33,7 @@ class TwinGlass:
 def doubled(surfels: Surfels) -> Surfels:
     """A float64 copy that requires gradients."""
     values = {name: tensor.detach().double().requires_grad_() for name, tensor in surfels.items()}
-    return type(surfels)(**values)
+    return surfels.like(values)
 
 
 def to_linear(color: Tensor) -> Tensor:
@@ -122,9 +122,8 @@ class GlassTwin:
 
     def _activated(self, name: str) -> tuple[ActivatedSurfels, Tensor]:
         raw = self.sets[name]
-        assert isinstance(raw, MaterialSurfels)
         surfels = activate(raw, self.camera.center, self.method.base.sh_degree(self.step))
-        made = activate_materials(raw, self.method.settings.materials)
+        made = activate_materials(raw)
         return surfels, torch.cat((surfels.colors, made.specular[:, None], made.roughness[:, None], made.f0), 1)
 
     def _trace(

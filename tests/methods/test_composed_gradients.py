@@ -43,7 +43,7 @@ def twin_render(method: Model, base, reflection, camera, images) -> TwinRender:
     """What ``method.render`` computes, from float64 copies of both sets, by the readable twins alone."""
     settings = method.settings
     surfels = activate(base, camera.center, method.base.sh_degree(STEP))
-    materials = activate_materials(base, settings.materials)
+    materials = activate_materials(base)
     features = torch.cat((surfels.colors, materials.specular[:, None], materials.roughness[:, None], materials.f0), 1)
     shape = (surfels.means, surfels.tangent_u, surfels.tangent_v, surfels.scales, surfels.opacities)
     options = surfel_options(training_maps(method, camera, STEP), settings.render, method.extent, weight_sum=False)
@@ -91,7 +91,7 @@ def twin_render(method: Model, base, reflection, camera, images) -> TwinRender:
 def doubled(surfels):
     """A float64 copy that requires gradients."""
     values = {name: tensor.detach().double().requires_grad_() for name, tensor in surfels.items()}
-    return type(surfels)(**values)
+    return surfels.like(values)
 
 
 CASES = {
@@ -134,7 +134,7 @@ def test_image_and_every_gradient_are_those_of_the_twins(case: str):
     (rendered.image * upstream.float()).sum().backward()
     for part, exact in zip(method.sets, (base, reflection), strict=True):
         for name, tensor in part.gaussians.items():
-            expected = getattr(exact, name).grad
+            expected = exact[name].grad
             if expected is None or float(expected.abs().max()) == 0:
                 assert tensor.grad is None or float(tensor.grad.abs().max()) < 1e-6, f"{part.name}.{name}"
                 continue

@@ -120,7 +120,7 @@ def test_a_training_step_at_the_corners_of_the_materials(made, specular: float, 
     surfels = method["base"].gaussians
     with torch.no_grad():
         for logits, value in (("specular_logits", specular), ("roughness_logits", roughness), ("f0_logits", f0)):
-            getattr(surfels, logits).fill_(value)
+            surfels[logits].fill_(value)
         surfels.quaternions[::4] = 0  # no direction at all
         surfels.log_scales[::5] = torch.tensor([-20.0, 1.0])  # needles
     view = made.scene.train[0]

@@ -62,7 +62,7 @@ def test_image_and_every_gradient_are_those_of_the_twins(case: str):
     (rendered.image * upstream.float()).sum().backward()
     for part in method.sets:
         for name, tensor in part.gaussians.items():
-            expected = getattr(twin_sets[part.name], name).grad
+            expected = twin_sets[part.name][name].grad
             if expected is None or float(expected.abs().max()) == 0:
                 assert tensor.grad is None or float(tensor.grad.abs().max()) < 1e-6, f"{part.name}.{name}"
                 continue

@@ -41,7 +41,7 @@ def test_a_scene_with_mirrors_keeps_its_second_stage(name: str):
     method = new_method(recipe(name, matte=MatteSettings(probation=0.05, views=3)), made, schedule())
     method.begin(Stage("reflection", 15, 60))
     with torch.no_grad():
-        method["base"].gaussians.specular_logits[:100] = 1.0  # type: ignore[union-attr]
+        method["base"].gaussians["specular_logits"][:100] = 1.0  # type: ignore[union-attr]
     told = []
     for step in range(15, 20):
         view = made.scene.train[step % len(made.scene.train)]

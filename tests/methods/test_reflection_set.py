@@ -135,10 +135,10 @@ def test_a_propagation_disturbs_the_colours_of_matte_surfels_alone():
     method.begin(Stage("reflection", 15, 60))
     base, settings = method["base"], PropagationSettings()
     with torch.no_grad():
-        base.gaussians.specular_logits.copy_(torch.linspace(-7, 1, len(base)))  # type: ignore[union-attr]
+        base.gaussians["specular_logits"].copy_(torch.linspace(-7, 1, len(base)))  # type: ignore[union-attr]
         base.gaussians.opacity_logits.copy_(torch.linspace(-3, 5, len(base)))
     before = base.gaussians.detached()
-    specular = before.specular_logits.sigmoid()  # type: ignore[union-attr]
+    specular = before["specular_logits"].sigmoid()  # type: ignore[union-attr]
     propagate_normals(base, settings, torch.Generator().manual_seed(0))
     after = base.gaussians.detached()
     noise = (after.sh_dc - before.sh_dc)[specular <= settings.sabotage_border]

@@ -16,7 +16,7 @@ from reflective_cases import SAMPLED, new_method, recipe, schedule, tiny, train_
 from safetensors.torch import load_file
 
 from rtgs.config import compose
-from rtgs.gaussians.materials import MATERIAL_NAMES, MaterialSurfels
+from rtgs.gaussians.materials import MATERIAL_NAMES, has_materials
 from rtgs.gaussians.settings import MaterialSettings
 from rtgs.methods import Mode, RenderOptions, Stage
 from rtgs.methods.model import Model
@@ -63,7 +63,7 @@ def test_the_first_stage_is_that_of_the_plain_method_and_the_second_adds_what_it
     assert method.sets == (method["base"],)
     method.begin(method.stages[1])
     assert [part.name for part in method.sets] == ["base", "reflection"]
-    assert isinstance(method["base"].gaussians, MaterialSurfels)
+    assert has_materials(method["base"].gaussians)
     assert len(method.sets[1]) == 3**3 * 4
     with torch.no_grad():
         rendered = method.render(view.camera, 15, Mode.EVALUATE, RenderOptions(layers=True))
@@ -135,9 +135,9 @@ def test_rtgs_starts_as_bright_as_the_mirror_ray_from_every_angle():
 def test_the_reflection_set_alone_learns_what_the_mirror_shows(name: str):
     method, made = in_second_stage(recipe(name, propagation=PropagationSettings(every=0)))
     with torch.no_grad():
-        method["base"].gaussians.specular_logits.fill_(2.0)  # type: ignore[union-attr]
-        method["base"].gaussians.f0_logits.fill_(3.0)  # type: ignore[union-attr]
-    held = tuple(field.name for field in fields(MaterialSurfels))
+        method["base"].gaussians["specular_logits"].fill_(2.0)  # type: ignore[union-attr]
+        method["base"].gaussians["f0_logits"].fill_(3.0)  # type: ignore[union-attr]
+    held = method["base"].gaussians.names
     view = made.scene.train[0]
     losses = []
     for step in range(15, 115):
@@ -156,7 +156,7 @@ def test_every_parameter_of_both_sets_learns():
         train_step(method, made, step)
     for part in method.sets:
         for name, tensor in part.gaussians.items():
-            moved = (tensor.detach() - getattr(before[part.name], name)).abs().amax()
+            moved = (tensor.detach() - before[part.name][name]).abs().amax()
             assert float(moved) > 0, f"{part.name}.{name}"
 
 
@@ -167,7 +167,7 @@ def test_the_normals_learn_from_reflection_alone():
     weight = torch.rand(rendered.image.shape, generator=torch.Generator().manual_seed(0))
     (weight * (rendered.image - rendered.buffers.features[:3])).sum().backward()
     for name in ("quaternions", "means", *MATERIAL_NAMES):
-        gradient = getattr(method["base"].gaussians, name).grad
+        gradient = method["base"].gaussians[name].grad
         assert float(gradient.abs().sum()) > 0, name
 
 
@@ -297,7 +297,7 @@ def test_a_matte_scene_is_recognised_before_anything_can_hurt_it_and_goes_on_as_
         kinds += [(step + 1, event.kind) for event in events if event.kind in ("decision", "propagation")]
     assert kinds == [(18, "decision")]
     assert method.sets == (method["base"],)
-    assert not isinstance(method["base"].gaussians, MaterialSurfels)
+    assert not has_materials(method["base"].gaussians)
     assert method.decisions[-1].what == "the reflection stage ended early"
     assert "nothing specular in this scene" in method.decisions[-1].why
     other = new_method(recipe(matte=matte), made, schedule())
@@ -313,7 +313,7 @@ def test_propagation_makes_opaque_grows_and_disturbs_as_envgs_does():
     quiet = PropagationSettings(every=20, until=0.9, hold_every=5)
     method, made = in_second_stage(recipe(propagation=quiet))
     with torch.no_grad():
-        method["base"].gaussians.specular_logits[:50] = 2.0
+        method["base"].gaussians["specular_logits"][:50] = 2.0
     for step in range(15, 19):
         train_step(method, made, step)
     before = method["base"].gaussians.detached()
@@ -331,10 +331,10 @@ def test_propagation_makes_opaque_grows_and_disturbs_as_envgs_does():
 def test_specular_resets_lower_the_weight_with_the_opacity():
     method, made = in_second_stage()
     with torch.no_grad():
-        method["base"].gaussians.specular_logits.fill_(3.0)
+        method["base"].gaussians["specular_logits"].fill_(3.0)
     for step in range(15, 40):
         train_step(method, made, step)
-    assert float(method["base"].gaussians.specular_logits.detach().sigmoid().max()) <= 1.0001e-3  # type: ignore[union-attr]
+    assert float(method["base"].gaussians["specular_logits"].detach().sigmoid().max()) <= 1.0001e-3  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize("name", ["rtgs", "envgs"])

@@ -216,8 +216,8 @@ def test_a_pane_has_no_second_bounce_and_a_set_behind_it():
     for stage in whole.stages[:2]:
         whole.begin(stage)
     with torch.no_grad():  # a base set that lies behind the pane as a whole: just beyond the ball's middle
-        whole.base.gaussians.means.copy_(
-            (BALL + 0.01 * (BALL - cameras[0].center)).expand_as(whole.base.gaussians.means)
+        whole["base"].gaussians.means.copy_(
+            (BALL + 0.01 * (BALL - cameras[0].center)).expand_as(whole["base"].gaussians.means)
         )
     (_, event) = whole.begin(whole.stages[2])
     assert event.detail == f"copies of {before} base surfels behind the pane"

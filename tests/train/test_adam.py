@@ -1,11 +1,11 @@
-"""SurfelAdam against torch.optim.Adam, its moments through changes of N, resume, non-finite gradients."""
+"""GaussianAdam against torch.optim.Adam, its moments through changes of N, resume, non-finite gradients."""
 
 from __future__ import annotations
 
 import pytest
 import torch
 
-from rtgs.gaussians.adam import NonFiniteGradientError, SurfelAdam, find_nonfinite
+from rtgs.gaussians.adam import GaussianAdam, NonFiniteGradientError, find_nonfinite
 from rtgs.gaussians.settings import OptimizerSettings
 from rtgs.gaussians.surfels import Surfels
 
@@ -41,7 +41,7 @@ def test_matches_torch(isa, count):
     generator = torch.Generator().manual_seed(3)
     surfels = surfels_of(count)
     twin = surfels.detached().requires_grad_()
-    adam = SurfelAdam(surfels, SETTINGS, extent=2.5, means_lr_steps=50)
+    adam = GaussianAdam(surfels, SETTINGS, extent=2.5, means_lr_steps=50)
     groups = [{"params": [values], "name": name} for name, values in twin.items()]
     reference = torch.optim.Adam(groups, eps=SETTINGS.eps)
     largest = {name: torch.zeros_like(values) for name, values in surfels.items()}
@@ -64,7 +64,7 @@ def test_matches_torch(isa, count):
 
 def test_unseen_rows_decay_as_in_adam(isa):
     surfels = surfels_of(3)
-    adam = SurfelAdam(surfels, SETTINGS, extent=1.0)
+    adam = GaussianAdam(surfels, SETTINGS, extent=1.0)
     draw = torch.Generator().manual_seed(0)
     for _, values in surfels.items():
         values.grad = torch.randn(values.shape, generator=draw)
@@ -80,7 +80,7 @@ def test_unseen_rows_decay_as_in_adam(isa):
 def test_inactive_bands_are_skipped_exactly(isa):
     generator = torch.Generator().manual_seed(5)
     skipping, whole = surfels_of(40), surfels_of(40)
-    adams = [SurfelAdam(s, SETTINGS, extent=1.0) for s in (skipping, whole)]
+    adams = [GaussianAdam(s, SETTINGS, extent=1.0) for s in (skipping, whole)]
     for step in range(12):
         degree = min(step // 3, 3)
         draw_gradients(skipping, generator, active=(degree + 1) ** 2 - 1)
@@ -98,14 +98,14 @@ def test_a_graph_of_the_old_values_refuses_its_backward_pass():
     surfels = surfels_of(3)
     loss = surfels.means.square().sum()
     loss.backward(retain_graph=True)
-    SurfelAdam(surfels, SETTINGS, extent=1.0).step(0)
+    GaussianAdam(surfels, SETTINGS, extent=1.0).step(0)
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):
         loss.backward()
 
 
 def test_bands_once_active_stay_active():
     surfels, twin = surfels_of(5), surfels_of(5)
-    adams = [SurfelAdam(s, SETTINGS, extent=1.0) for s in (surfels, twin)]
+    adams = [GaussianAdam(s, SETTINGS, extent=1.0) for s in (surfels, twin)]
     for s in (surfels, twin):
         for _, values in s.items():
             values.grad = torch.ones_like(values)
@@ -116,7 +116,7 @@ def test_bands_once_active_stay_active():
 
 
 def test_learning_rate_of_the_means_decays_exponentially():
-    adam = SurfelAdam(surfels_of(1), SETTINGS, extent=4.0, means_lr_steps=1000)
+    adam = GaussianAdam(surfels_of(1), SETTINGS, extent=4.0, means_lr_steps=1000)
     rates = [adam.learning_rates(step)["means"] for step in (0, 500, 1000, 5000)]
     assert rates == pytest.approx([6.4e-4, 6.4e-5, 6.4e-6, 6.4e-6])
     assert adam.learning_rates(500)["opacity_logits"] == 0.05
@@ -124,7 +124,7 @@ def test_learning_rate_of_the_means_decays_exponentially():
 
 def test_denormal_moments_die_out(isa):
     surfels = surfels_of(4)
-    adam = SurfelAdam(surfels, SETTINGS, extent=1.0)
+    adam = GaussianAdam(surfels, SETTINGS, extent=1.0)
     for magnitude in (1e-25, 1e-20, 1e-10, 1.0):
         surfels.means.grad = torch.full_like(surfels.means, magnitude)
         adam.step(0)
@@ -138,7 +138,7 @@ def test_denormal_moments_die_out(isa):
 @pytest.mark.parametrize("magnitude", [1e-45, 1e-38, 1e-19, 1e15, 1e19, 1e25, 3e38])
 def test_any_finite_gradient_keeps_parameters_finite(isa, magnitude):
     surfels = surfels_of(21)
-    adam = SurfelAdam(surfels, SETTINGS, extent=1.0)
+    adam = GaussianAdam(surfels, SETTINGS, extent=1.0)
     for step in range(3):
         for _, values in surfels.items():
             values.grad = torch.full_like(values, magnitude)
@@ -149,13 +149,13 @@ def test_any_finite_gradient_keeps_parameters_finite(isa, magnitude):
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
 def test_nonfinite_gradient_is_reported_and_does_not_enter(isa, bad):
     surfels = surfels_of(50)
-    adam = SurfelAdam(surfels, SETTINGS, extent=1.0)
+    adam = GaussianAdam(surfels, SETTINGS, extent=1.0)
     for _, values in surfels.items():
         values.grad = torch.ones_like(values)
     surfels.quaternions.grad[7, 2] = bad
     surfels.sh_rest.grad[49, 14] = bad
     with pytest.raises(
-        NonFiniteGradientError, match=r"step 11: quaternions: 1 NaN or inf, surfels 7; sh_rest: 3"
+        NonFiniteGradientError, match=r"step 11: quaternions: 1 NaN or inf, rows 7; sh_rest: 3"
     ) as caught:
         adam.step(11)
     assert [(r.name, r.count, r.rows) for r in caught.value.report] == [("quaternions", 1, (7,)), ("sh_rest", 3, (49,))]
@@ -175,7 +175,7 @@ def test_find_nonfinite_names_the_first_surfels(isa):
 
 def test_keep_append_and_zero_carry_the_rows():
     surfels = surfels_of(4)
-    adam = SurfelAdam(surfels, SETTINGS, extent=1.0)
+    adam = GaussianAdam(surfels, SETTINGS, extent=1.0)
     for moments in (adam.first, adam.second):
         for _, values in moments.items():
             values += torch.arange(4.0).reshape(-1, *[1] * (values.ndim - 1)) + 1
@@ -194,7 +194,7 @@ def test_keep_append_and_zero_carry_the_rows():
 
 def test_change_of_n_behind_its_back_is_refused():
     surfels = surfels_of(4)
-    adam = SurfelAdam(surfels, SETTINGS, extent=1.0)
+    adam = GaussianAdam(surfels, SETTINGS, extent=1.0)
     surfels.means = torch.zeros(5, 3)
     surfels.means.grad = torch.zeros(5, 3)
     with pytest.raises(RuntimeError, match="apply_plan"):
@@ -203,32 +203,32 @@ def test_change_of_n_behind_its_back_is_refused():
 
 def test_no_surfels_and_no_gradient():
     empty = surfels_of(0)
-    adam = SurfelAdam(empty, SETTINGS, extent=1.0)
+    adam = GaussianAdam(empty, SETTINGS, extent=1.0)
     for _, values in empty.items():
         values.grad = torch.zeros_like(values)
     adam.step(0)
     some = surfels_of(3)
     before = some.detached()
-    SurfelAdam(some, SETTINGS, extent=1.0).step(0)
+    GaussianAdam(some, SETTINGS, extent=1.0).step(0)
     assert torch.equal(before.means, some.means)
 
 
 def test_resume_is_exact():
-    def train(steps: range, surfels: Surfels, adam: SurfelAdam) -> None:
+    def train(steps: range, surfels: Surfels, adam: GaussianAdam) -> None:
         for step in steps:
             draw_gradients(surfels, torch.Generator().manual_seed(step))
             adam.step(step, sh_degree=3 if step == 8 else 1)  # the moments of the higher bands outlive the kill
 
     straight = surfels_of(30)
-    straight_adam = SurfelAdam(straight, SETTINGS, extent=1.0)
+    straight_adam = GaussianAdam(straight, SETTINGS, extent=1.0)
     train(range(20), straight, straight_adam)
 
     first = surfels_of(30)
-    first_adam = SurfelAdam(first, SETTINGS, extent=1.0)
+    first_adam = GaussianAdam(first, SETTINGS, extent=1.0)
     train(range(9), first, first_adam)
     state = {name: values.clone() for name, values in first_adam.state().items()}
     second = first.detached().requires_grad_()
-    second_adam = SurfelAdam(second, SETTINGS, extent=1.0)
+    second_adam = GaussianAdam(second, SETTINGS, extent=1.0)
     second_adam.load(state)
     train(range(9, 20), second, second_adam)
     for (name, a), (_, b) in zip(straight.items(), second.items()):
@@ -236,18 +236,18 @@ def test_resume_is_exact():
 
 
 def test_load_refuses_another_set():
-    state = SurfelAdam(surfels_of(3), SETTINGS, extent=1.0).state()
-    with pytest.raises(ValueError, match=r"first.means is \(3, 3\) but the surfels need \(4, 3\)"):
-        SurfelAdam(surfels_of(4), SETTINGS, extent=1.0).load(state)
+    state = GaussianAdam(surfels_of(3), SETTINGS, extent=1.0).state()
+    with pytest.raises(ValueError, match=r"first.means is \(3, 3\) but the Gaussians need \(4, 3\)"):
+        GaussianAdam(surfels_of(4), SETTINGS, extent=1.0).load(state)
     del state["steps"]
     with pytest.raises(ValueError, match="lacks steps"):
-        SurfelAdam(surfels_of(3), SETTINGS, extent=1.0).load(state)
+        GaussianAdam(surfels_of(3), SETTINGS, extent=1.0).load(state)
 
 
 @pytest.mark.parametrize("extent", [0.0, -1.0, float("nan")])
 def test_bad_extent(extent):
     with pytest.raises(ValueError, match="scene extent"):
-        SurfelAdam(surfels_of(1), SETTINGS, extent)
+        GaussianAdam(surfels_of(1), SETTINGS, extent)
 
 
 def test_same_bits_for_any_thread_count(isa):
@@ -256,7 +256,7 @@ def test_same_bits_for_any_thread_count(isa):
     for threads in (1, 2, 3):
         torch.set_num_threads(threads)
         surfels = surfels_of(3001)
-        adam = SurfelAdam(surfels, SETTINGS, extent=1.0)
+        adam = GaussianAdam(surfels, SETTINGS, extent=1.0)
         for step in range(3):
             draw_gradients(surfels, torch.Generator().manual_seed(step))
             adam.step(step, sh_degree=step + 1)

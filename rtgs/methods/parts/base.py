@@ -11,9 +11,8 @@ from torch import Tensor
 
 from rtgs.core.decisions import Decision
 from rtgs.gaussians.initialize import gaussians_from_points
-from rtgs.gaussians.materials import MaterialSurfels, activate_materials
 from rtgs.gaussians.primitives import Gaussians
-from rtgs.gaussians.settings import DensitySettings, MaterialSettings, McmcSettings
+from rtgs.gaussians.settings import DensitySettings, McmcSettings
 from rtgs.gaussians.surfels import ActivatedSurfels
 from rtgs.methods.parts.gaussian_set import GaussianSet, densified, opacity_reset
 from rtgs.methods.parts.kinds import GaussianKind, RasterRequest
@@ -114,7 +113,7 @@ class BaseSet(Part):
         watched = self.watched(frame)
         rows = self.set.activated(frame.camera.center.float(), self.sh_degree(frame.step))
         probe = self.set.new_probe() if watched else None
-        features = composited(self.set.gaussians, rows.colors, self.settings.materials)
+        features = composited(self.set.gaussians, rows.colors)
         shape, features = _joined(Rows(rows, features), appended)
         more = len(shape.means) - len(self.set)  # rows that density control does not watch
         request = RasterRequest(
@@ -165,12 +164,12 @@ def mcmc_of(density: DensitySettings) -> McmcSettings | None:
     return density.mcmc if density.strategy == "mcmc" else None
 
 
-def composited(gaussians: Gaussians, colors: Tensor, settings: MaterialSettings) -> Tensor:
-    """(N, C) what is composited of a set: SH colours (N, 3), and with materials k_s, roughness, f0."""
-    if not isinstance(gaussians, MaterialSurfels):
+def composited(gaussians: Gaussians, colors: Tensor) -> Tensor:
+    """(N, C) what is composited of a set: SH colours (N, 3), then every channel as it is activated, in its order."""
+    if not gaussians.channels:
         return colors
-    materials = activate_materials(gaussians, settings)
-    return torch.cat((colors, materials.specular[:, None], materials.roughness[:, None], materials.f0), dim=1)
+    channels = (gaussians.activated(channel.name) for channel in gaussians.channels)
+    return torch.cat((colors, *(values.reshape(len(colors), -1) for values in channels)), dim=1)
 
 
 def _joined(base: Rows, appended: Sequence[Rows]) -> tuple[ActivatedSurfels, Tensor]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping
 
 import torch
@@ -10,7 +9,7 @@ from torch import Tensor
 
 from rtgs.core.errors import RtgsError
 from rtgs.gaussians.activate import activate_surfels
-from rtgs.gaussians.adam import SurfelAdam
+from rtgs.gaussians.adam import GaussianAdam
 from rtgs.gaussians.density import DensityReport
 from rtgs.gaussians.mcmc import density_control
 from rtgs.gaussians.primitives import Gaussians
@@ -20,7 +19,7 @@ from rtgs.train.method import Observation, StepEvent
 
 
 class GaussianSet:
-    """Gaussians of one kind + :class:`SurfelAdam` + density control, kept consistent through every change of N.
+    """Gaussians of one kind + :class:`GaussianAdam` + density control, kept consistent through every change of N.
 
     ``name`` prefixes its tensors in a checkpoint and its lines in reports; ``extent`` is the scene's, world units.
     """
@@ -46,8 +45,8 @@ class GaussianSet:
     def __len__(self) -> int:
         return len(self.gaussians)
 
-    def _new_optimizer(self) -> SurfelAdam:
-        return SurfelAdam(self.gaussians, self._optimizer_settings, self.extent, means_lr_steps=self._means_lr_steps)
+    def _new_optimizer(self) -> GaussianAdam:
+        return GaussianAdam(self.gaussians, self._optimizer_settings, self.extent, means_lr_steps=self._means_lr_steps)
 
     def activated(self, camera_center: Tensor, sh_degree: int) -> ActivatedSurfels:
         """Activated Gaussians as seen from ``camera_center`` (3,) world, SH up to ``sh_degree``."""
@@ -84,7 +83,7 @@ class GaussianSet:
         if observation is not None and observation.probe.grad is not None:
             self.density.observe(observation.probe.grad, observation.weight_sum)
         for name in held:
-            getattr(self.gaussians, name).grad = None  # Adam leaves a parameter without one alone
+            self.gaussians[name].grad = None  # Adam leaves a parameter without one alone
         self.optimizer.step(step, sh_degree)
         self.optimizer.zero_grad()
         self._clamp()
@@ -104,19 +103,9 @@ class GaussianSet:
         """Lower every opacity to the settings' reset value."""
         self.density.reset_opacity(self.gaussians, self.optimizer)
 
-    @torch.no_grad()
     def _clamp(self) -> None:
-        """Keep the activations finite whatever the learning rate (method.md 14).
-
-        exp overflows float32 at 88, and a logit beyond 13.8 has a sigmoid derivative below 1e-6 from which Adam cannot
-        return; the other parameters are used as they are, and Adam bounds their drift by learning rate times steps.
-        """
-        limits = self._optimizer_settings
-        smallest, largest = (math.log(share * self.extent) for share in (limits.smallest_scale, limits.largest_scale))
-        self.gaussians.log_scales.clamp_(smallest, largest)
-        for name, values in self.gaussians.items():
-            if name.endswith("_logits"):
-                values.clamp_(-limits.opacity_logit_limit, limits.opacity_logit_limit)
+        """Keep the activations finite whatever the learning rate."""
+        self.optimizer.clamp()
 
     def state(self) -> dict[str, Tensor]:
         """Every tensor of the set under dotted names (checkpoints call the parameters of any kind ``surfels``)."""
@@ -147,7 +136,7 @@ class GaussianSet:
                     f"the checkpoint has no {self.name}.surfels.{name}: it was written by another method or version; "
                     "train again from the start"
                 )
-            setattr(self.gaussians, name, parameters[name].clone().requires_grad_())
+            self.gaussians[name] = parameters[name].clone().requires_grad_()
         self.optimizer = self._new_optimizer()  # moments of the loaded number of rows
         self.optimizer.load(part("adam"))
         self.density.load(part("density"))

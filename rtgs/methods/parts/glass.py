@@ -12,7 +12,7 @@ from torch import Tensor
 from rtgs.core.cameras import Camera
 from rtgs.core.decisions import Decision
 from rtgs.core.errors import RtgsError
-from rtgs.gaussians.materials import MaterialSurfels
+from rtgs.gaussians.materials import material_channels
 from rtgs.gaussians.surfels import Surfels
 from rtgs.mesh.container import ObjectGuide, ObjectMesh, ObjectSurfaces
 from rtgs.mesh.silhouettes import bounding
@@ -218,7 +218,7 @@ class Glass(Part):
             rebuild_every=settings.rebuild_every,
         )
 
-    def _interface_set(self, surfels: MaterialSurfels) -> InterfaceSet:
+    def _interface_set(self, surfels: Surfels) -> InterfaceSet:
         made = InterfaceSet(
             "interface",
             surfels,
@@ -236,7 +236,7 @@ class Glass(Part):
         if self.interface is None:
             return None
         shape = self.interface.activated(frame.camera.center.float(), self.base.sh_degree(frame.step))
-        return Rows(shape, composited(self.interface.gaussians, shape.colors, self.settings.materials))
+        return Rows(shape, composited(self.interface.gaussians, shape.colors))
 
     def pixels(self, frame: Frame, flat: SurfacePixels) -> GlassPixels | None:
         """The pixels of the view's mask in training, of the silhouette or of given masks else."""
@@ -341,7 +341,8 @@ class Glass(Part):
         self._glass = state[_GLASS].bool() if self.begun else self._glass
         if _LEFT_OUT in state and self._left_out is None:
             self._leave_out(float(state[_LEFT_OUT]))
-        own, interface = stored_surfels(state, "transmittance"), stored_surfels(state, "interface", MaterialSurfels)
+        own = stored_surfels(state, "transmittance")
+        interface = stored_surfels(state, "interface", material_channels(self.settings.materials))
         self.transmittance = None if own is None else self._transmittance_set(own)
-        self.interface = None if interface is None else self._interface_set(interface)  # type: ignore[arg-type]
+        self.interface = None if interface is None else self._interface_set(interface)
         self._base_tree.clear()

@@ -12,7 +12,7 @@ from torch import Tensor
 from rtgs.gaussians.density import logit
 from rtgs.gaussians.harmonics import rest_count
 from rtgs.gaussians.initialize import neighbor_distance
-from rtgs.gaussians.materials import MaterialSurfels, with_materials
+from rtgs.gaussians.materials import with_materials
 from rtgs.gaussians.primitives import tangents
 from rtgs.gaussians.surfels import Surfels
 from rtgs.mesh.container import ObjectMesh
@@ -72,7 +72,7 @@ def normal_quaternions(normals: Tensor) -> Tensor:
 
 def interface_surfels(
     settings: MethodSettings, mesh: ObjectMesh, glass: Tensor, colors_of: Surfels, generator: torch.Generator
-) -> MaterialSurfels:
+) -> Surfels:
     """Surfels spread over the faces ``glass`` (F,) bool of the mesh, with its normals, the colour of the nearest of
     ``colors_of``, and materials of their own."""
     own = settings.transmittance.interface
@@ -87,6 +87,5 @@ def interface_surfels(
         sh_dc=colors_of.sh_dc.detach()[torch.from_numpy(nearest)].clone(),
         sh_rest=torch.zeros(len(points), rest_count(settings.init.sh_degree), 3),
     )
-    made = with_materials(plain, replace(settings.materials, f0=own.f0, roughness=own.roughness))
-    made.specular_logits = torch.full((len(points),), logit(own.specular))
-    return made
+    materials = replace(settings.materials, specular=own.specular, f0=own.f0, roughness=own.roughness)
+    return with_materials(plain, materials)

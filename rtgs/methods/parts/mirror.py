@@ -6,14 +6,16 @@ image = (1 - k_s) C_d + k_s w_r C_r, and inside transparent objects + k_s w_t C_
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol
 
 import torch
 from torch import Tensor
 
 from rtgs.core.decisions import Decision
-from rtgs.gaussians.materials import MaterialSurfels, with_materials, without_materials
+from rtgs.gaussians.channels import Channel
+from rtgs.gaussians.materials import has_materials, with_materials, without_materials
+from rtgs.gaussians.primitives import PARAMETERS
 from rtgs.gaussians.surfels import Surfels
 from rtgs.methods.parts.base import BaseSet
 from rtgs.methods.parts.gaussian_set import GaussianSet, densified, opacity_reset
@@ -146,7 +148,7 @@ class Mirror(Part):
         """Begin, if that has not happened yet."""
         if self.set is not None:
             return
-        self.base.set.adopt(with_materials(self.base.set.gaussians, self.settings.materials))  # type: ignore[arg-type]
+        self.base.set.adopt(with_materials(self.base.set.gaussians, self.settings.materials))
         settings = self.settings.reflection
         color = scene_color(settings.init_color, (view.image for view in self._views))
         self._adopt(reflection_surfels(settings, self._points, self.extent, self.generator, color))
@@ -324,7 +326,7 @@ class Mirror(Part):
             yield StepEvent("decision", "reflection", f"goes on: {evidence}")
             return
         self.set = None
-        self.base.set.adopt(without_materials(self.base.set.gaussians))  # type: ignore[arg-type]
+        self.base.set.adopt(without_materials(self.base.set.gaussians))
         self._matte = evidence
         decision = self.decisions[-1]
         yield StepEvent("decision", "reflection", f"{decision.what}: {decision.why}")
@@ -365,16 +367,16 @@ class Mirror(Part):
     def restore(self, state: Mapping[str, Tensor]) -> None:
         """Materials and the reflection set as the state has them."""
         gaussians, specular = self.base.set.gaussians, "base.surfels.specular_logits" in state
-        if specular != isinstance(gaussians, MaterialSurfels):
-            plain = without_materials(gaussians)  # type: ignore[arg-type]
+        if specular != has_materials(gaussians):
+            plain = without_materials(gaussians)
             self.base.set.adopt(with_materials(plain, self.settings.materials) if specular else plain)
         self._adopt(stored_surfels(state, "reflection"))
         if "matte" in state:
             self._matte = MatteEvidence.of(state["matte"])
 
 
-def stored_surfels(state: Mapping[str, Tensor], name: str, kind: type[Surfels] = Surfels) -> Surfels | None:
-    """The raw surfels of a set in a state; None: it is not there."""
-    names = [field.name for field in fields(kind)]
-    found = {key: state[f"{name}.surfels.{key}"] for key in names if f"{name}.surfels.{key}" in state}
-    return kind(**{key: found[key].clone() for key in names}) if found else None
+def stored_surfels(state: Mapping[str, Tensor], name: str, channels: tuple[Channel, ...] = ()) -> Surfels | None:
+    """The raw surfels of a set in a state, with these channels; None: it is not there."""
+    names = (*PARAMETERS, *(channel.name for channel in channels))
+    found = {key: state[f"{name}.surfels.{key}"].clone() for key in names if f"{name}.surfels.{key}" in state}
+    return Surfels.of(found, channels) if found else None

@@ -7,7 +7,7 @@ import math
 import torch
 
 from rtgs.gaussians.density import logit
-from rtgs.gaussians.materials import MaterialSurfels
+from rtgs.gaussians.materials import has_materials
 from rtgs.methods.parts.gaussian_set import GaussianSet
 from rtgs.methods.settings import PropagationSettings
 from rtgs.train.method import StepEvent
@@ -21,8 +21,8 @@ def propagate_normals(base: GaussianSet, settings: PropagationSettings, generato
     colour has baked in, so that reflection has something left to explain. Moments of what changed become 0.
     """
     surfels = base.gaussians
-    assert isinstance(surfels, MaterialSurfels)
-    specular = surfels.specular_logits.sigmoid()
+    assert has_materials(surfels)
+    specular = surfels["specular_logits"].sigmoid()
     surfels.opacity_logits.clamp_(min=logit(settings.opacity))
     base.optimizer.zero_moments("opacity_logits")
     grown = specular >= settings.grow_border
@@ -41,6 +41,6 @@ def propagate_normals(base: GaussianSet, settings: PropagationSettings, generato
 def reset_specular(base: GaussianSet, specular: float) -> None:
     """k_s becomes min(k_s, its initial value), as EnvGS does (3DGS-DR raises it instead); its moments become 0."""
     surfels = base.gaussians
-    assert isinstance(surfels, MaterialSurfels)
-    surfels.specular_logits.clamp_(max=logit(specular))
+    assert has_materials(surfels)
+    surfels["specular_logits"].clamp_(max=logit(specular))
     base.optimizer.zero_moments("specular_logits")

@@ -12,7 +12,7 @@ from torch import Tensor
 from rtgs.core.cameras import Camera
 from rtgs.gaussians.density import RowPlan, apply_plan, select_rows
 from rtgs.gaussians.initialize import points_box
-from rtgs.gaussians.materials import MaterialSurfels, without_materials
+from rtgs.gaussians.materials import without_materials
 from rtgs.gaussians.surfels import Surfels
 from rtgs.mesh.container import ObjectMesh
 from rtgs.methods.parts.gaussian_set import GaussianSet
@@ -43,7 +43,8 @@ def take_out(base: GaussianSet, rows: Tensor, kept: Tensor) -> Surfels:
     taken = select_rows(base.gaussians, rows)
     nothing = select_rows(base.gaussians, torch.zeros(0, dtype=torch.int64))
     apply_plan(RowPlan((~rows | kept).nonzero()[:, 0], nothing), base.gaussians, base.optimizer, base.density)
-    return without_materials(taken) if isinstance(taken, MaterialSurfels) else taken  # type: ignore[return-value]
+    assert isinstance(taken, Surfels)
+    return without_materials(taken)
 
 
 def random_surfels(settings: TransmittanceSettings, box: Tensor, generator: torch.Generator) -> Surfels:
