@@ -5,13 +5,18 @@ from __future__ import annotations
 from dataclasses import replace
 
 from rtgs.gaussians.settings import MaterialSettings, OptimizerSettings
-from rtgs.methods.settings import UNREAD_TRANSMITTANCE, MethodSettings, ReflectionSettings
+from rtgs.methods.settings import InterfaceSettings, MethodSettings, ReflectionSettings, TransmittanceSettings
 from rtgs.optics.settings import OpticsSettings
 from rtgs.train.settings import LossSettings
 
 _SECOND_STAGE_LOSSES = ("perceptual", "specular")
 _THIRD_STAGE_LOSSES = ("transmission_depth",)
 _MATERIAL_RATES = ("specular_logits", "roughness_logits", "f0_logits")
+# What recipes of the stages before the third spell for these settings, which they do not read. It is what the defaults
+# once were, and stays when they change: else all those artifacts would be made again.
+_UNREAD = TransmittanceSettings(
+    enabled=False, max_gain=None, interface=InterfaceSettings(normal_loss=0.2, normal_hold=0.0)
+)
 
 
 def diffuse_alone(settings: MethodSettings) -> MethodSettings:
@@ -22,7 +27,7 @@ def diffuse_alone(settings: MethodSettings) -> MethodSettings:
         materials=MaterialSettings(),
         optics=OpticsSettings(),
         reflection=ReflectionSettings(),
-        transmittance=UNREAD_TRANSMITTANCE,
+        transmittance=_UNREAD,
         loss=_without_losses(settings.loss, (*_SECOND_STAGE_LOSSES, *_THIRD_STAGE_LOSSES)),
         optimizer=replace(settings.optimizer, **rates),
     )
@@ -33,11 +38,7 @@ def without_transmittance(settings: MethodSettings) -> MethodSettings:
     masks = settings.transmittance.enabled and settings.loss.specular_start < settings.transmittance.start
     unread = _THIRD_STAGE_LOSSES if masks else (*_THIRD_STAGE_LOSSES, "specular")
     # The start stays where L_spec is read, so that this function finds the same when it is asked again.
-    kept = (
-        replace(UNREAD_TRANSMITTANCE, enabled=True, start=settings.transmittance.start)
-        if masks
-        else UNREAD_TRANSMITTANCE
-    )
+    kept = replace(_UNREAD, enabled=True, start=settings.transmittance.start) if masks else _UNREAD
     return replace(settings, transmittance=kept, loss=_without_losses(settings.loss, unread))
 
 

@@ -248,13 +248,6 @@ class TransmittanceSettings:
         refuse_unless(every >= 0, "method.transmittance.opacity_reset_every", every, "at least 0 (0: never)")
 
 
-# What recipes of the stages before the third spell for these settings, which they do not read. It is what the defaults
-# once were, and stays when they change: else all those artifacts would be made again.
-UNREAD_TRANSMITTANCE = TransmittanceSettings(
-    enabled=False, max_gain=None, interface=InterfaceSettings(normal_loss=0.2, normal_hold=0.0)
-)
-
-
 @dataclass(frozen=True)
 class MethodSettings:
     """A method: which recipe, with which numbers. ``name`` selects the class in ``rtgs.methods``."""
