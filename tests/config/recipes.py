@@ -1,0 +1,114 @@
+"""Recipes of many runs, and the digests that golden_recipes.json holds of them: old stores must still be read.
+
+``python tests/config/recipes.py`` writes the file anew. Do so only when a recipe is meant to change.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from unittest.mock import patch
+
+import yaml
+
+from pipelines.planning.graph import build_graph
+from rtgs.config.locate import choices_of, conf_dir
+from rtgs.config.sweep import ComposedJob, compose_jobs
+from rtgs.scenes.once import captures_read_once
+from rtgs.workflow.plan import topological
+
+GOLDEN = Path(__file__).with_name("golden_recipes.json")
+SCENES = ("ball_statue", "toycar", "matte_room")
+TOLD_IN_FULL = ("ball_statue rtgs smoke none", "toycar envgs paper none")
+
+# Words beside scene, method and preset. They set keys in every room, defaults and values of YAML files among them.
+OVERRIDES = (
+    ("rtgs", "seed=3"),
+    ("rtgs", "seed=3 schedule.total=333 scene.long_side=120"),
+    ("rtgs", "method.optics.blend=linear"),
+    ("rtgs", "method.optics.weight=literal method.optics.remap=none method.optics.masking=separable"),
+    ("rtgs", "method.transmittance.interface.normal_hold=0.0"),
+    ("rtgs", "method.transmittance.interface.normal_hold=5.0 method.transmittance.interface.normal_loss=0.2"),
+    ("rtgs", "method.transmittance.max_gain=null method.transmittance.interface.count=0"),
+    ("rtgs", "method.transmittance.enabled=false method.loss.specular=0.1"),
+    ("rtgs", "method.loss.specular_start=0.35 method.loss.perceptual=0.02 method.loss.perceptual_form=vgg_l1"),
+    ("rtgs", "method.loss.transmission_depth_form=mean method.transmittance.compositing=sum"),
+    ("rtgs", "method.reflection.direction_gradient=last_sh method.reflection.sh_direction=raw"),
+    ("rtgs", "method.reflection.init_color=bright method.reflection.background=mean"),
+    ("rtgs", "method.materials.specular=0.1 method.materials.roughness_curve=linear method.materials.f0_channels=3"),
+    ("rtgs", "method.optimizer.specular_logits=0.01 method.optimizer.sh_dc=0.003"),
+    ("rtgs", "masks=none normals=none"),
+    ("rtgs", "mesh.source=tsdf mesh.of=scene mesh.object.flat=yes mesh.tsdf.max_blocks=5000"),
+    ("rtgs", "mesh.source=hull mesh.object.hull.voxels=64 mesh.object.pane.agree=0.5"),
+    ("envgs", "method.optics.blend=linear method.optics.weight=split_sum"),
+    ("envgs", "method.transmittance.interface.normal_hold=5.0 method.transmittance.first_surface=base"),
+    ("envgs", "method.reflection.density.strategy=mcmc method.density.strategy=mcmc"),
+    ("envgs", "method.loss.specular=0.2 method.loss.perceptual_start=0.4 method.loss.perceptual_crop=48"),
+    ("2dgs", "mesh.extract=true mesh.only_masked=true mesh.depth_ratio=1.0"),
+    ("2dgs", "method.loss.mono_normal=0.01 method.loss.mono_normal_form=envgs evaluation.lpips=false"),
+    ("2dgs", "method.materials.specular=0.2 method.optics.blend=linear method.loss.specular=0.2"),
+    ("2dgs", "method.density.max_per_pixel=0.3 method.init.random_points=500 method.render.depth_ratio=1.0"),
+    ("3dgs", "method.render.antialiased=true method.render.dilation=0.1 scene.split_every=5"),
+    ("3dgs", "method.density.strategy=mcmc method.density.mcmc.growth=0.1"),
+)
+
+
+def fitting(method: str) -> list[str]:
+    """The ablations that are for the method, ``none`` first."""
+    found = ["none"]
+    for name in choices_of("ablation"):
+        methods = yaml.safe_load((conf_dir() / "ablation" / f"{name}.yaml").read_text())["ablation"].get("methods")
+        if name != "none" and (not methods or method in methods):
+            found.append(name)
+    return found
+
+
+def recipes(method: str) -> Iterator[tuple[str, list[str]]]:
+    """Runs of a method: each in words, and ``step fingerprint`` of all its steps but the report, upstream first.
+
+    Ablations go with the published preset, every preset with none. A report states every value with its default: it is
+    made in seconds, and its recipe may change.
+    """
+    paths = ",".join(f"embedded:{scene}" for scene in SCENES)  # as a value, for files are composed once for all three
+    with captures_read_once(), patch("rtgs.pretrained.weights.weight_folders", tuple):  # a machine without networks
+        for presets, ablations in (("paper", fitting(method)), ("smoke,quick,standard", ["none"])):
+            files = [f"method={method}", f"preset={presets}", f"ablation={','.join(ablations)}"]
+            for job in _jobs(["scene=ball_statue", *files, f"scene.path={paths}"]):
+                assert job.config is not None
+                assert job.choices is not None
+                scene = job.config.scene.path.split(":")[1]
+                yield f"{scene} {method} {job.choices.preset} {job.choices.ablation}", steps_of(job)
+        for words in (words for of, words in OVERRIDES if of == method):
+            (job,) = _jobs(["scene=ball_statue", f"method={method}", "preset=smoke", *words.split()])
+            yield f"ball_statue {method} smoke {words}", steps_of(job)
+
+
+def _jobs(words: Sequence[str]) -> tuple[ComposedJob, ...]:
+    return compose_jobs(words, multirun=True)[0]
+
+
+def steps_of(job: ComposedJob) -> list[str]:
+    """``step fingerprint`` of the steps of a run, upstream first."""
+    assert job.config is not None, job.problem
+    assert job.choices is not None
+    steps = topological(build_graph(job.config, job.choices).targets)
+    return [f"{step.name} {step.fingerprint}" for step in steps if step.name != "report"]
+
+
+def digest(steps: Sequence[str]) -> str:
+    """16 digits for all the steps of a run."""
+    return hashlib.sha256("\n".join(steps).encode()).hexdigest()[:16]
+
+
+def main() -> None:
+    """Write golden_recipes.json."""
+    found = {words: steps for method in choices_of("method") for words, steps in recipes(method)}
+    told = {words: found[words] for words in TOLD_IN_FULL}
+    content = {"in full": told, "digests": {words: digest(steps) for words, steps in found.items()}}
+    GOLDEN.write_text(json.dumps(content, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
