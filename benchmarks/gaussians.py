@@ -21,9 +21,9 @@ from rtgs.gaussians.adam import SurfelAdam, find_nonfinite
 from rtgs.gaussians.density import DensityControl
 from rtgs.gaussians.initialize import surfels_from_points
 from rtgs.gaussians.ply import read_ply, write_ply
+from rtgs.gaussians.settings import DensitySettings, InitSettings, OptimizerSettings
 from rtgs.gaussians.surfels import Surfels, activate
 from rtgs.native import core
-from rtgs.train.settings import DensitySettings, InitSettings, OptimizerSettings
 
 CENTER = torch.tensor([0.1, 0.2, 0.3])
 EXTENT = 5.0  # a fifth of the surfels is split, a few are too large

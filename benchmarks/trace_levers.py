@@ -46,7 +46,7 @@ STRIDES = (1, 2, 3)
 
 def defaults() -> dict[str, float]:
     """Where the defaults of training sit on the levers that training has."""
-    from rtgs.train.settings import ReflectionSettings
+    from rtgs.methods.settings import ReflectionSettings
 
     settings = ReflectionSettings()
     return {

@@ -22,10 +22,12 @@ from torch import Tensor
 
 from benchmarks.yardstick_scene import yardstick_case
 from rtgs.core.cameras import Camera
+from rtgs.gaussians.settings import OptimizerSettings
 from rtgs.gaussians.surfels import ActivatedSurfels
 from rtgs.methods import create_method
 from rtgs.methods.parts.gaussian_set import GaussianSet
 from rtgs.methods.parts.kinds import surfel_options
+from rtgs.methods.settings import MethodSettings
 from rtgs.native import core
 from rtgs.render.buffers import RasterBuffers
 from rtgs.render.surfels import rasterize_surfels
@@ -33,7 +35,7 @@ from rtgs.scenes.scene import Scene, View
 from rtgs.train.guard import check_loss
 from rtgs.train.losses import normal_consistency_loss, photometric_loss
 from rtgs.train.method import LossValues, Mode, RenderedView
-from rtgs.train.settings import LossSettings, MethodSettings, OptimizerSettings, ScheduleSettings
+from rtgs.train.settings import LossSettings, ScheduleSettings
 
 STEP = 10  # any step at which all SH degrees are active
 

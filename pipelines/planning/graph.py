@@ -25,7 +25,8 @@ from pipelines.steps import (
 from pipelines.steps.training import StageParams
 from rtgs.config.schema import Choices, RunConfig
 from rtgs.methods import find_method
-from rtgs.train.settings import MethodSettings, ScheduleSettings
+from rtgs.methods.settings import MethodSettings
+from rtgs.train.settings import ScheduleSettings
 from rtgs.workflow import Step, StepKind
 from rtgs.workflow.fingerprint import flatten
 

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING
 
 from rtgs.core.build import build
 from rtgs.core.errors import RtgsError
+from rtgs.methods.settings import MethodSettings
 from rtgs.track import Tracker
-from rtgs.train.settings import MethodSettings, ScheduleSettings
+from rtgs.train.settings import ScheduleSettings
 from rtgs.workflow import StepContext
 from rtgs.workflow.manifest import Manifest
 

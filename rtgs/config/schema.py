@@ -12,10 +12,11 @@ from typing import Any
 
 from rtgs.core.refuse import refuse_unless
 from rtgs.mesh.settings import SOURCES, ObjectSettings, TsdfSettings
+from rtgs.methods.settings import MethodSettings
 from rtgs.prepare.masks.settings import MaskSettings
 from rtgs.prepare.settings import NormalSettings, SfmSettings
 from rtgs.scenes.settings import SceneSettings
-from rtgs.train.settings import MethodSettings, ScheduleSettings
+from rtgs.train.settings import ScheduleSettings
 
 SCHEMA_NAME = "run_schema"
 _DOT = "__"  # in the names of twins

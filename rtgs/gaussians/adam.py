@@ -13,8 +13,8 @@ from torch.autograd.graph import increment_version
 
 from rtgs.gaussians.harmonics import rest_count
 from rtgs.gaussians.primitives import Gaussians
+from rtgs.gaussians.settings import OptimizerSettings
 from rtgs.native import core
-from rtgs.train.settings import OptimizerSettings
 
 REPORTED_ROWS = 8
 

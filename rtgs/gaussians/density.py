@@ -17,7 +17,7 @@ from torch import Tensor
 
 from rtgs.gaussians.adam import SurfelAdam
 from rtgs.gaussians.primitives import Gaussians
-from rtgs.train.settings import DensitySettings
+from rtgs.gaussians.settings import DensitySettings
 
 Kind = TypeVar("Kind", bound=Gaussians)
 

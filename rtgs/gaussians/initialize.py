@@ -13,8 +13,8 @@ from torch import Tensor
 from rtgs.core.errors import RtgsError
 from rtgs.gaussians.harmonics import rest_count, rgb_to_sh_dc
 from rtgs.gaussians.primitives import Gaussians
+from rtgs.gaussians.settings import InitSettings
 from rtgs.gaussians.surfels import Surfels
-from rtgs.train.settings import InitSettings
 
 SMALLEST_SQUARED_DISTANCE = 1e-7  # world units squared: the scale of duplicate points
 BOX_QUANTILES = (0.005, 0.995)  # per axis: the scene box without far outliers (method.md 6.1)

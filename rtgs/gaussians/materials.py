@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from rtgs.gaussians.density import logit
+from rtgs.gaussians.settings import MaterialSettings
 from rtgs.gaussians.surfels import Surfels
-from rtgs.train.specular_settings import MaterialSettings
 
 
 @dataclass

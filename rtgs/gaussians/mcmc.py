@@ -13,7 +13,7 @@ from torch import Tensor
 from rtgs.gaussians.adam import SurfelAdam
 from rtgs.gaussians.density import DensityControl, DensityReport, RowPlan, apply_plan, select_rows
 from rtgs.gaussians.primitives import Gaussians
-from rtgs.train.settings import DensitySettings
+from rtgs.gaussians.settings import DensitySettings
 
 MOST_OPAQUE = 1 - 1e-6  # what counts as an opacity of 1: beyond, no number of copies is equal to it
 SLIGHTEST_NOISE = 1e-4  # of full strength: fainter noise is left out

@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from rtgs.methods.registry import find_method, method_names, own_methods
+from rtgs.methods.settings import MethodSettings
 from rtgs.methods.spec import MethodSpec, StageSpec
 from rtgs.train.method import (
     LossValue,
@@ -21,7 +22,7 @@ from rtgs.train.method import (
     Stage,
     StepEvent,
 )
-from rtgs.train.settings import MethodSettings, ScheduleSettings
+from rtgs.train.settings import ScheduleSettings
 
 if TYPE_CHECKING:
     import torch

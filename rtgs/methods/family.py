@@ -9,7 +9,8 @@ from rtgs.methods.spec import StageSpec
 from rtgs.train.schedule import reflection_plan, transmittance_plan
 
 if TYPE_CHECKING:
-    from rtgs.train.settings import MethodSettings, ScheduleSettings
+    from rtgs.methods.settings import MethodSettings
+    from rtgs.train.settings import ScheduleSettings
 
 
 def _reflection_start(settings: MethodSettings, schedule: ScheduleSettings) -> int:

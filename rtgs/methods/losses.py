@@ -15,6 +15,7 @@ from rtgs.core.cameras import Camera
 from rtgs.core.decisions import Decision
 from rtgs.methods.parts.base import BaseSet
 from rtgs.methods.parts.glass import Glass
+from rtgs.methods.settings import MethodSettings
 from rtgs.methods.shading.straight import depth_loss, mesh_normal_loss
 from rtgs.pretrained.weights import MissingWeights
 from rtgs.render.buffers import RasterBuffers
@@ -28,7 +29,7 @@ from rtgs.train.losses import (
 from rtgs.train.method import RenderedView, RenderOptions
 from rtgs.train.perceptual import PerceptualLoss
 from rtgs.train.schedule import loss_start
-from rtgs.train.settings import LossSettings, MethodSettings
+from rtgs.train.settings import LossSettings
 from rtgs.train.terms import LossTerm, term_start
 
 if TYPE_CHECKING:

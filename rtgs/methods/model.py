@@ -32,9 +32,10 @@ from rtgs.train.terms import LossTerm, table_of
 
 if TYPE_CHECKING:
     from rtgs.mesh.container import ObjectMesh
+    from rtgs.methods.settings import MethodSettings
     from rtgs.methods.spec import MethodSpec
     from rtgs.scenes.scene import Scene, View
-    from rtgs.train.settings import MethodSettings, ScheduleSettings
+    from rtgs.train.settings import ScheduleSettings
 
 NO_OPTIONS = RenderOptions()
 

@@ -4,15 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from rtgs.gaussians.settings import MaterialSettings, OptimizerSettings
+from rtgs.methods.settings import MethodSettings, ReflectionSettings, TransmittanceSettings
 from rtgs.optics.settings import OpticsSettings
-from rtgs.train.settings import (
-    LossSettings,
-    MethodSettings,
-    OptimizerSettings,
-    ReflectionSettings,
-    TransmittanceSettings,
-)
-from rtgs.train.specular_settings import MaterialSettings
+from rtgs.train.settings import LossSettings
 
 _SECOND_STAGE_LOSSES = ("perceptual", "specular")
 _THIRD_STAGE_LOSSES = ("transmission_depth",)

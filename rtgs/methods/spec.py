@@ -14,7 +14,8 @@ from rtgs.train.method import Stage
 
 if TYPE_CHECKING:
     from rtgs.methods.model import Model, Setup
-    from rtgs.train.settings import MethodSettings, ScheduleSettings
+    from rtgs.methods.settings import MethodSettings
+    from rtgs.train.settings import ScheduleSettings
 
 SURFACE = "surface"  # Gaussians with a normal and a depth: losses on surfaces, meshes
 MIRROR = "mirror"  # reflected light of its own

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
-from rtgs.train.settings import ReflectionSettings, ScheduleSettings, TransmittanceSettings
+from rtgs.train.settings import ScheduleSettings
+
+if TYPE_CHECKING:
+    from rtgs.methods.settings import ReflectionSettings, TransmittanceSettings
 
 
 def check_schedule(schedule: ScheduleSettings) -> None:

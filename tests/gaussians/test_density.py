@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from rtgs.gaussians.adam import SurfelAdam
 from rtgs.gaussians.density import DensityControl, DensityReport, RowPlan, apply_plan, logit, select_rows, split_surfels
+from rtgs.gaussians.settings import DensitySettings, OptimizerSettings
 from rtgs.gaussians.surfels import Surfels, tangents
-from rtgs.train.settings import DensitySettings, OptimizerSettings
 
 EXTENT = 2.0  # small <= 0.02 < large <= 0.2 < too large
 SMALL, LARGE, TOO_LARGE = 0.01, 0.1, 0.5

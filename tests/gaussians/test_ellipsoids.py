@@ -14,8 +14,8 @@ from rtgs.gaussians.adam import SurfelAdam
 from rtgs.gaussians.density import DensityControl, RowPlan, apply_plan, select_rows, split_surfels
 from rtgs.gaussians.ellipsoids import Ellipsoids
 from rtgs.gaussians.primitives import Gaussians
+from rtgs.gaussians.settings import DensitySettings, OptimizerSettings
 from rtgs.gaussians.surfels import Surfels
-from rtgs.train.settings import DensitySettings, OptimizerSettings
 
 
 def covariance(gaussians: Gaussians) -> Tensor:

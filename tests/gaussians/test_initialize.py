@@ -5,7 +5,7 @@ import torch
 
 from rtgs.gaussians.activate import activate_surfels
 from rtgs.gaussians.initialize import neighbor_distance, points_box, random_points, surfels_from_points
-from rtgs.train.settings import InitSettings
+from rtgs.gaussians.settings import InitSettings
 
 
 def cloud(count: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:

@@ -17,10 +17,9 @@ from rtgs.gaussians.materials import (
     without_materials,
 )
 from rtgs.gaussians.ply import read_ply, write_ply
+from rtgs.gaussians.settings import DensitySettings, MaterialSettings, OptimizerSettings
 from rtgs.gaussians.surfels import Surfels
 from rtgs.methods.parts.gaussian_set import GaussianSet
-from rtgs.train.settings import DensitySettings, OptimizerSettings
-from rtgs.train.specular_settings import MaterialSettings
 
 
 @pytest.mark.parametrize("channels", [1, 3])

@@ -16,9 +16,9 @@ from rtgs.gaussians.adam import SurfelAdam
 from rtgs.gaussians.density import DensityControl
 from rtgs.gaussians.ellipsoids import Ellipsoids
 from rtgs.gaussians.mcmc import McmcControl, density_control, draw_copies, shared_opacity, shared_shrink
+from rtgs.gaussians.settings import DensitySettings, McmcSettings, OptimizerSettings
 from rtgs.gaussians.surfels import Surfels, activate
 from rtgs.render.reference.ellipsoids import rasterize_ellipsoids
-from rtgs.train.settings import DensitySettings, McmcSettings, OptimizerSettings
 
 MCMC = DensitySettings(strategy="mcmc", max_surfels=100, cap_share=1.0)
 

@@ -11,20 +11,15 @@ from mirror_scene import BALL, RADIUS, ball_hit, mirror_scene, room_hit, wall_co
 from reflective_cases import recipe, schedule
 from torch import Tensor
 
+from rtgs.gaussians.settings import DensitySettings, InitSettings
 from rtgs.mesh.container import ObjectMesh
 from rtgs.mesh.triangles import TriangleMesh
 from rtgs.methods import create_method
 from rtgs.methods.model import Model
+from rtgs.methods.settings import InterfaceSettings, MethodSettings, TransmittanceSettings
 from rtgs.scenes.scene import Scene, View
 from rtgs.train.seeds import generator_for
-from rtgs.train.settings import (
-    DensitySettings,
-    InitSettings,
-    MethodSettings,
-    ScheduleSettings,
-    TransmittanceSettings,
-)
-from rtgs.train.specular_settings import InterfaceSettings
+from rtgs.train.settings import ScheduleSettings
 from rtgs.train.trainer import Trainer
 
 CORE = 0.3  # radius of what is inside

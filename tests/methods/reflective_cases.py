@@ -8,21 +8,20 @@ from pathlib import Path
 from mirror_scene import MirrorScene, mirror_scene
 
 from rtgs.core.cameras import Camera
+from rtgs.gaussians.settings import DensitySettings, InitSettings, OptimizerSettings
 from rtgs.methods import Mode, RenderOptions, create_method
 from rtgs.methods.model import Model
 from rtgs.methods.parts.part import Frame
+from rtgs.methods.settings import (
+    MatteSettings,
+    MethodSettings,
+    PropagationSettings,
+    ReflectionSettings,
+    TracedShareSettings,
+)
 from rtgs.optics.settings import OpticsSettings
 from rtgs.train.seeds import generator_for
-from rtgs.train.settings import (
-    DensitySettings,
-    InitSettings,
-    LossSettings,
-    MethodSettings,
-    OptimizerSettings,
-    ReflectionSettings,
-    ScheduleSettings,
-)
-from rtgs.train.specular_settings import MatteSettings, PropagationSettings, TracedShareSettings
+from rtgs.train.settings import LossSettings, ScheduleSettings
 from rtgs.train.trainer import Trainer
 
 NEVER_MATTE = MatteSettings(probation=0.0)

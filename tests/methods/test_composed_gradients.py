@@ -10,11 +10,13 @@ from reflective_cases import new_method, recipe, schedule, tiny, training_maps
 from torch import Tensor
 
 from rtgs.gaussians.materials import activate_materials
+from rtgs.gaussians.settings import MaterialSettings
 from rtgs.gaussians.surfels import activate
 from rtgs.methods import Mode, Stage
 from rtgs.methods.model import Model
 from rtgs.methods.parts.kinds import surfel_options
 from rtgs.methods.parts.reflection_init import scene_color
+from rtgs.methods.settings import PropagationSettings
 from rtgs.methods.shading.mirror import (
     SHORTEST_NORMAL,
     mirror_rays,
@@ -27,7 +29,6 @@ from rtgs.render.discontinuities.surfels import discontinuity_mask
 from rtgs.render.discontinuities.trace import fragile_rays
 from rtgs.render.reference import surfels as reference
 from rtgs.render.reference import trace as reference_trace
-from rtgs.train.specular_settings import MaterialSettings, PropagationSettings
 
 STEP = 40  # SH of degree 2 in both sets
 

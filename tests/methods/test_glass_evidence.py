@@ -18,10 +18,10 @@ from rtgs.methods import Mode, RenderOptions
 from rtgs.methods.model import Model
 from rtgs.methods.parts.glass_evidence import glass_faces, on_surface, seen_bare
 from rtgs.methods.parts.interface_set import normal_quaternions
+from rtgs.methods.settings import InterfaceSettings
 from rtgs.methods.shading.mirror import SurfacePixels
 from rtgs.methods.shading.straight import glass_pixels, widened
 from rtgs.scenes.scene import View
-from rtgs.train.specular_settings import InterfaceSettings
 
 LABEL = -0.1  # of the radius: above this height the ball is covered
 VOTED = InterfaceSettings(count=150, masked_share=0.5)

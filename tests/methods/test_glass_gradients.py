@@ -9,8 +9,9 @@ import torch
 from glass_cases import begun, glass_recipe, glass_scene, randomised
 from glass_twin import GlassTwin, doubled
 
+from rtgs.gaussians.settings import MaterialSettings
+from rtgs.methods.settings import InterfaceSettings
 from rtgs.train.method import Mode
-from rtgs.train.specular_settings import InterfaceSettings, MaterialSettings
 
 STEP = 40  # SH of degree 2 in the base set
 

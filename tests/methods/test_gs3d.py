@@ -12,9 +12,10 @@ from rtgs.config import compose
 from rtgs.core.errors import RtgsError
 from rtgs.gaussians.ellipsoids import Ellipsoids
 from rtgs.gaussians.ply import read_gaussians, write_ply
+from rtgs.gaussians.settings import DensitySettings
 from rtgs.methods import Mode, RenderOptions, create_method
+from rtgs.methods.settings import MethodSettings
 from rtgs.train.seeds import generator_for
-from rtgs.train.settings import DensitySettings, MethodSettings
 
 ELLIPSOIDS = small_method("3dgs")
 MCMC = replace(ELLIPSOIDS, density=DensitySettings(strategy="mcmc", max_surfels=330, cap_share=1.0))

@@ -11,8 +11,8 @@ from mirror_scene import BALL
 
 from rtgs.gaussians.density import select_rows
 from rtgs.methods.parts.interface_set import interface_surfels, normal_quaternions
+from rtgs.methods.settings import InterfaceSettings
 from rtgs.train.method import Mode
-from rtgs.train.specular_settings import InterfaceSettings
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from reflective_cases import new_method, recipe, schedule, tiny
 
 from rtgs.methods import Mode, Stage
 from rtgs.methods.parts.matte import MatteEvidence, gather_evidence
-from rtgs.train.specular_settings import MatteSettings
+from rtgs.methods.settings import MatteSettings
 
 
 def test_evidence_is_the_share_of_specular_pixels_and_what_tracing_lowers_there():

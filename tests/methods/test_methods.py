@@ -9,13 +9,16 @@ import torch
 from training_cases import HEIGHT, WIDTH, small_method, small_scene, small_schedule
 
 from rtgs.core.errors import RtgsError
+from rtgs.gaussians.settings import DensitySettings
 from rtgs.methods import Mode, RenderOptions, Stage, create_method, find_method, method_names
 from rtgs.methods import losses as method_losses
 from rtgs.methods.parts import kinds as module
+from rtgs.methods.settings import MethodSettings
 from rtgs.render.buffers import RasterOptions
+from rtgs.render.settings import RenderSettings
 from rtgs.train import losses
 from rtgs.train.seeds import generator_for
-from rtgs.train.settings import DensitySettings, LossSettings, MethodSettings, RenderSettings
+from rtgs.train.settings import LossSettings
 
 
 def make(settings: MethodSettings | None = None, *, normals: bool = False, **schedule: int):

@@ -7,8 +7,9 @@ from dataclasses import replace
 import pytest
 from training_cases import small_method, small_schedule, small_trainer
 
+from rtgs.gaussians.settings import DensitySettings
 from rtgs.methods.parts.pixel_bound import bound_by_pixels, within_pixels
-from rtgs.train.settings import DensitySettings, ReflectionSettings
+from rtgs.methods.settings import ReflectionSettings
 
 
 @pytest.mark.parametrize(("share", "cap"), [(None, 900), (2.0, 900), (0.5, 500), (0.0001, 1)])

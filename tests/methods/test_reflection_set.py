@@ -10,15 +10,15 @@ import torch
 from reflective_cases import new_method, recipe, schedule, tiny
 
 from rtgs.config import compose
+from rtgs.gaussians.settings import DensitySettings
 from rtgs.gaussians.surfels import activate
 from rtgs.methods import Mode, Stage
 from rtgs.methods.parts.propagation import propagate_normals
 from rtgs.methods.parts.reflection_init import reflection_surfels
 from rtgs.methods.parts.traced_set import FollowingTree, trace_set
+from rtgs.methods.settings import PropagationSettings, ReflectionSettings
 from rtgs.render.buffers import TraceOptions
 from rtgs.render.reference.trace import find_hits, traced_rays, traced_surfels
-from rtgs.train.settings import DensitySettings, ReflectionSettings
-from rtgs.train.specular_settings import PropagationSettings
 
 MOST_HITS = 80  # of a ray at the start (kernels.md: 32^3 x 5 whole surfels cost 161)
 

@@ -9,8 +9,10 @@ import pytest
 import torch
 from reflective_cases import new_method, recipe, schedule, tiny
 
+from rtgs.gaussians.settings import MaterialSettings
 from rtgs.methods import Mode, RenderOptions, Stage
 from rtgs.methods.parts import mirror
+from rtgs.methods.settings import MatteSettings, TracedShareSettings
 from rtgs.methods.shading.traced_pixels import choose_pixels
 from rtgs.optics.settings import OpticsSettings
 from rtgs.train.schedule import (
@@ -20,7 +22,6 @@ from rtgs.train.schedule import (
     propagation_due,
     reflection_reset_due,
 )
-from rtgs.train.specular_settings import MaterialSettings, MatteSettings, TracedShareSettings
 
 
 def test_every_event_of_the_plan_happens_and_no_other():

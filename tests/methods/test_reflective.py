@@ -17,13 +17,19 @@ from safetensors.torch import load_file
 
 from rtgs.config import compose
 from rtgs.gaussians.materials import MATERIAL_NAMES, MaterialSurfels
+from rtgs.gaussians.settings import MaterialSettings
 from rtgs.methods import Mode, RenderOptions, Stage
 from rtgs.methods.model import Model
 from rtgs.methods.parts.reflection_init import reflection_box, reflection_surfels, scene_color
+from rtgs.methods.settings import (
+    MatteSettings,
+    MethodSettings,
+    PropagationSettings,
+    ReflectionSettings,
+    TracedShareSettings,
+)
 from rtgs.optics.microfacet import specular_weights
 from rtgs.train.checkpoint import checkpoint_path
-from rtgs.train.settings import MethodSettings, ReflectionSettings
-from rtgs.train.specular_settings import MaterialSettings, MatteSettings, PropagationSettings, TracedShareSettings
 from rtgs.train.trainer import Trainer
 
 TESTS = Path(__file__).parent

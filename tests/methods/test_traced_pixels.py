@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
+from rtgs.methods.settings import TracedShareSettings
 from rtgs.methods.shading.traced_pixels import choose_pixels, share_rays, tile_order
-from rtgs.train.specular_settings import TracedShareSettings
 
 
 @pytest.mark.parametrize(("width", "height", "tile"), [(16, 8, 8), (13, 7, 4), (5, 3, 8), (40, 30, 16)])

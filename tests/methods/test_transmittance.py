@@ -17,9 +17,8 @@ from rtgs.gaussians.density import logit
 from rtgs.mesh.triangles import TriangleMesh
 from rtgs.methods import Mode, RenderOptions, Stage, create_method, find_method
 from rtgs.methods.parts.transmittance_init import random_surfels
+from rtgs.methods.settings import InterfaceSettings, MethodSettings, TransmittanceSettings
 from rtgs.train.seeds import generator_for
-from rtgs.train.settings import MethodSettings, TransmittanceSettings
-from rtgs.train.specular_settings import InterfaceSettings
 from rtgs.train.trainer import Trainer
 
 LAYERS = RenderOptions(layers=True)

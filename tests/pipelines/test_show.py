@@ -17,9 +17,9 @@ from rtgs.core.cameras import Camera
 from rtgs.gaussians.ellipsoids import Ellipsoids
 from rtgs.gaussians.initialize import gaussians_from_points
 from rtgs.gaussians.ply import write_ply
+from rtgs.gaussians.settings import InitSettings
 from rtgs.render.splats import render_splats
 from rtgs.scenes.scene import load_scene
-from rtgs.train.settings import InitSettings
 
 
 @pytest.fixture(scope="module")

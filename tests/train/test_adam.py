@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from rtgs.gaussians.adam import NonFiniteGradientError, SurfelAdam, find_nonfinite
+from rtgs.gaussians.settings import OptimizerSettings
 from rtgs.gaussians.surfels import Surfels
-from rtgs.train.settings import OptimizerSettings
 
 SETTINGS = OptimizerSettings()
 

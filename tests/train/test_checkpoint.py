@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from rtgs.methods.settings import MethodSettings
 from rtgs.train import checkpoint as module
 from rtgs.train.checkpoint import (
     Checkpoint,
@@ -25,7 +26,7 @@ from rtgs.train.checkpoint import (
     load_newest,
     save_checkpoint,
 )
-from rtgs.train.settings import LossSettings, MethodSettings, ScheduleSettings
+from rtgs.train.settings import LossSettings, ScheduleSettings
 
 PLAIN = RunSettings(MethodSettings(), ScheduleSettings(), 0)
 

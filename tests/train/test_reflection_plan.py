@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 
 from rtgs.config import compose
+from rtgs.methods.settings import MatteSettings, PropagationSettings, ReflectionSettings
 from rtgs.train.schedule import (
     base_densify_due,
     base_reset_due,
@@ -20,8 +21,6 @@ from rtgs.train.schedule import (
     sh_degree_at,
     transmittance_plan,
 )
-from rtgs.train.settings import ReflectionSettings
-from rtgs.train.specular_settings import MatteSettings, PropagationSettings
 
 
 def paper(method: str):

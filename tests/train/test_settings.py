@@ -5,8 +5,9 @@ import math
 import pytest
 
 from rtgs.config import compose
-from rtgs.train.settings import LossSettings, OptimizerSettings
-from rtgs.train.specular_settings import InterfaceSettings
+from rtgs.gaussians.settings import OptimizerSettings
+from rtgs.methods.settings import InterfaceSettings
+from rtgs.train.settings import LossSettings
 from rtgs.workflow.fingerprint import canonical_json
 
 

@@ -8,8 +8,8 @@ import pytest
 import torch
 from training_cases import small_method, small_scene, small_schedule, small_trainer
 
+from rtgs.gaussians.settings import OptimizerSettings
 from rtgs.train.method import Mode
-from rtgs.train.settings import OptimizerSettings
 
 
 def violent(factor: float) -> OptimizerSettings:

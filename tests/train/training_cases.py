@@ -8,10 +8,12 @@ from pathlib import Path
 import torch
 
 from rtgs.core.cameras import Camera
+from rtgs.gaussians.settings import DensitySettings
 from rtgs.methods import create_method
+from rtgs.methods.settings import MethodSettings
 from rtgs.scenes.scene import Scene, View
 from rtgs.train.seeds import generator_for
-from rtgs.train.settings import DensitySettings, LossSettings, MethodSettings, ScheduleSettings
+from rtgs.train.settings import LossSettings, ScheduleSettings
 from rtgs.train.trainer import Trainer
 
 WIDTH, HEIGHT = 40, 30

@@ -13,6 +13,7 @@ from rtgs.core.decisions import Decision
 from rtgs.gaussians.initialize import gaussians_from_points
 from rtgs.gaussians.materials import MaterialSurfels, activate_materials
 from rtgs.gaussians.primitives import Gaussians
+from rtgs.gaussians.settings import DensitySettings, MaterialSettings, McmcSettings
 from rtgs.gaussians.surfels import ActivatedSurfels
 from rtgs.methods.parts.gaussian_set import GaussianSet, densified, opacity_reset
 from rtgs.methods.parts.kinds import GaussianKind, RasterRequest
@@ -27,7 +28,7 @@ from rtgs.train.schedule import (
     opacity_was_reset,
     sh_degree_at,
 )
-from rtgs.train.settings import DensitySettings, MaterialSettings, McmcSettings, ScheduleSettings
+from rtgs.train.settings import ScheduleSettings
 
 if TYPE_CHECKING:
     from rtgs.methods.model import Setup

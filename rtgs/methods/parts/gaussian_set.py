@@ -14,9 +14,9 @@ from rtgs.gaussians.adam import SurfelAdam
 from rtgs.gaussians.density import DensityReport
 from rtgs.gaussians.mcmc import density_control
 from rtgs.gaussians.primitives import Gaussians
+from rtgs.gaussians.settings import DensitySettings, OptimizerSettings
 from rtgs.gaussians.surfels import ActivatedSurfels
 from rtgs.train.method import Observation, StepEvent
-from rtgs.train.settings import DensitySettings, OptimizerSettings
 
 
 class GaussianSet:

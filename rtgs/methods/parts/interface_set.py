@@ -17,7 +17,7 @@ from rtgs.gaussians.primitives import tangents
 from rtgs.gaussians.surfels import Surfels
 from rtgs.mesh.container import ObjectMesh
 from rtgs.methods.parts.gaussian_set import GaussianSet
-from rtgs.train.settings import MethodSettings
+from rtgs.methods.settings import MethodSettings
 
 _NORMALS = "normals"  # in the state
 

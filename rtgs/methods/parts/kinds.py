@@ -13,9 +13,9 @@ from rtgs.gaussians.primitives import Gaussians
 from rtgs.gaussians.surfels import ActivatedSurfels, Surfels
 from rtgs.render.buffers import EllipsoidOptions, RasterBuffers, RasterOptions
 from rtgs.render.ellipsoids import rasterize_ellipsoids
+from rtgs.render.settings import RenderSettings
 from rtgs.render.surfels import rasterize_surfels
 from rtgs.train.method import RenderOptions
-from rtgs.train.settings import RenderSettings
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from rtgs.train.specular_settings import MatteSettings
+from rtgs.methods.settings import MatteSettings
 
 if TYPE_CHECKING:
     from rtgs.scenes.scene import View

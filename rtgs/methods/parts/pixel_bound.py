@@ -6,7 +6,8 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from rtgs.core.decisions import Decision
-from rtgs.train.settings import DensitySettings, MethodSettings
+from rtgs.gaussians.settings import DensitySettings
+from rtgs.methods.settings import MethodSettings
 
 
 def within_pixels(density: DensitySettings, pixels: int) -> DensitySettings:

@@ -9,8 +9,8 @@ import torch
 from rtgs.gaussians.density import logit
 from rtgs.gaussians.materials import MaterialSurfels
 from rtgs.methods.parts.gaussian_set import GaussianSet
+from rtgs.methods.settings import PropagationSettings
 from rtgs.train.method import StepEvent
-from rtgs.train.specular_settings import PropagationSettings
 
 
 @torch.no_grad()

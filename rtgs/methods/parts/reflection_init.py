@@ -10,7 +10,7 @@ from torch import Tensor
 from rtgs.gaussians.initialize import points_box
 from rtgs.gaussians.surfels import Surfels
 from rtgs.methods.parts.stratified import stratified_surfels
-from rtgs.train.settings import ReflectionSettings
+from rtgs.methods.settings import ReflectionSettings
 
 PIXEL_STRIDE = 37  # of the training pixels that a scene's colour is taken from
 

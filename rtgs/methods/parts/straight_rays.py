@@ -12,10 +12,10 @@ from rtgs.mesh.container import ObjectMesh
 from rtgs.methods.parts.base import BaseSet
 from rtgs.methods.parts.part import Frame
 from rtgs.methods.parts.traced_set import FollowingTree, TracedSet, trace_set
+from rtgs.methods.settings import MethodSettings
 from rtgs.methods.shading.straight import GlassRays, Transmission
 from rtgs.render.buffers import TraceBuffers, TraceOptions
 from rtgs.train.method import FirstBounce, Observation
-from rtgs.train.settings import MethodSettings
 
 
 @dataclass(frozen=True)

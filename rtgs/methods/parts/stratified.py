@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from rtgs.gaussians.initialize import surfels_from_points
+from rtgs.gaussians.settings import InitSettings
 from rtgs.gaussians.surfels import Surfels
-from rtgs.train.settings import InitSettings
 
 
 def stratified_surfels(

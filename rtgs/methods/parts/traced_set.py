@@ -9,12 +9,12 @@ from torch import Tensor
 
 from rtgs.gaussians.activate import activate_geometry
 from rtgs.gaussians.density import DensityReport
+from rtgs.gaussians.settings import DensitySettings, OptimizerSettings
 from rtgs.gaussians.surfels import Surfels
 from rtgs.methods.parts.gaussian_set import GaussianSet
 from rtgs.render.buffers import TraceBuffers, TraceOptions
 from rtgs.render.trace import SurfelTree, trace_surfels
 from rtgs.train.method import Observation
-from rtgs.train.settings import DensitySettings, OptimizerSettings
 
 
 class FollowingTree:

@@ -17,7 +17,7 @@ from rtgs.gaussians.surfels import Surfels
 from rtgs.mesh.container import ObjectMesh
 from rtgs.methods.parts.gaussian_set import GaussianSet
 from rtgs.methods.parts.stratified import stratified_surfels
-from rtgs.train.settings import TransmittanceSettings
+from rtgs.methods.settings import TransmittanceSettings
 
 
 def rows_inside(surfels: Surfels, mesh: ObjectMesh, margin: float, cameras: Sequence[Camera]) -> Tensor:

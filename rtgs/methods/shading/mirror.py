@@ -13,12 +13,12 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from rtgs.gaussians.settings import MaterialSettings
 from rtgs.native import core
 from rtgs.optics.light import decoded, encoded
 from rtgs.optics.microfacet import SpecularWeights, specular_weights
 from rtgs.optics.reflection import reflection_weight
 from rtgs.optics.settings import OpticsSettings
-from rtgs.train.specular_settings import MaterialSettings
 
 SHORTEST_NORMAL = 1e-3  # an accumulated normal shorter than this has no direction: such a pixel has no surface
 

@@ -8,7 +8,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from rtgs.train.specular_settings import TracedShareSettings
+from rtgs.methods.settings import TracedShareSettings
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,275 @@
+"""Every number of a method that is not of one room below, with its source: later stages, and the method as a whole.
+
+Boundaries are shares of the run (``schedule.total``), intervals are steps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from rtgs.core.refuse import refuse_bad_numbers, refuse_unless
+from rtgs.gaussians.settings import DensitySettings, InitSettings, MaterialSettings, OptimizerSettings
+from rtgs.optics.settings import OpticsSettings
+from rtgs.render.settings import RenderSettings
+from rtgs.train.settings import LossSettings, ScheduleSettings
+
+
+@dataclass(frozen=True)
+class PropagationSettings:
+    """EnvGS's normal propagation and colour sabotage (method.md 6.1; invented in 3DGS-DR)."""
+
+    every: int = 1000  # steps; 0 = never. Not at the steps of an opacity reset
+    until: float = 0.3  # share of the run: 18,000 of 60,000
+    opacity: float = 0.9  # opacities of the base set become at least this
+    grow: float = 1.5  # scales of specular surfels are multiplied by it
+    grow_border: float = 0.02  # specular: k_s at least this
+    hold_every: int = 200  # opacities stand still until the next multiple of it
+    sabotage: float = 0.4  # half width of the uniform noise added to SH dc; 0 = none
+    sabotage_border: float = 0.05  # surfels with k_s at most this get it
+    densify_every: int = 500  # interval of the base set's density control while propagation runs
+
+    def __post_init__(self) -> None:
+        refuse_bad_numbers(self, "method.reflection.propagation")
+        refuse_unless(0 <= self.until <= 1, "method.reflection.propagation.until", self.until, "between 0 and 1")
+        refuse_unless(self.every >= 0, "method.reflection.propagation.every", self.every, "at least 0 (0: never)")
+        for name in ("hold_every", "densify_every"):
+            value = getattr(self, name)
+            refuse_unless(value >= 1, f"method.reflection.propagation.{name}", value, "at least 1 step")
+
+
+@dataclass(frozen=True)
+class TracedShareSettings:
+    """Which pixels get a mirror ray: those that show one, in training a random part of the rest; which share one."""
+
+    threshold: float = 0.0  # k_s * max(w_r, 1) below which a pixel counts as one of the rest; 0 = trace all, as EnvGS
+    share: float = 0.25  # of the rest, in training: whole tiles, drawn afresh each step, gradients times 1 / share
+    tile: int = 8  # side of these tiles, pixels
+    # In training after matte.probation, the pixels of a 2x2 block below this k_s * max(w_r, 1) show the colour of one
+    # mirror ray, each step of another of them: an error of at most so much of what their rays differ. 0 = never (EnvGS)
+    shared_below: float = 0.0
+
+    def __post_init__(self) -> None:
+        refuse_bad_numbers(self, "method.reflection.traced")
+        refuse_unless(0 < self.share <= 1, "method.reflection.traced.share", self.share, "above 0 and at most 1")
+        refuse_unless(
+            self.tile >= 4 and self.tile % 4 == 0, "method.reflection.traced.tile", self.tile, "a multiple of 4"
+        )
+
+
+@dataclass(frozen=True)
+class MatteSettings:
+    """How a scene with nothing specular is recognised, from its training views alone (docs/reflection.md)."""
+
+    probation: float = 1 / 60  # share of the run: then the stage is judged, before any propagation or reset; 0 = never
+    views: int = 12  # training views looked at, evenly spaced
+    # A pixel counts as specular when its k_s is at least this; with fewer of them than the share the scene is matte.
+    # Measured on a mirror ball of strength 0 / 0.3 / 0.8 (docs/reflection.md): at most 0.04 % / at least 3 % / 2 %.
+    specular: float = 0.15
+    share: float = 0.002
+
+    def __post_init__(self) -> None:
+        refuse_bad_numbers(self, "method.reflection.matte")
+        refuse_unless(0 <= self.probation <= 1, "method.reflection.matte.probation", self.probation, "between 0 and 1")
+        refuse_unless(self.views >= 1, "method.reflection.matte.views", self.views, "at least 1")
+
+
+def _reflection_density() -> DensitySettings:
+    return DensitySettings(gradient_threshold=1e-4, max_surfels=700_000)  # EnvGS; the signal is the tracer's
+
+
+@dataclass(frozen=True)
+class ReflectionSettings:
+    """The reflection set and its part of the schedule (method.md 3.2, 6.1, 6.2).
+
+    Boundaries are shares of the run, so that they keep their sense when it shrinks; intervals are steps, because what
+    they wait for (views seen, recovery from a reset) takes as many steps in a short run as in a long one. Learning
+    rates are those of ``method.optimizer``, the same for both sets unless ``rate_gain`` says otherwise.
+    """
+
+    start: float = 0.05  # share of the run: 3,000 of 60,000
+    densify_until: float = 0.35  # 21,000 of 60,000
+    densify_every: int = 500
+    opacity_reset_every: int = 6_000  # 0 = never; only while densifying
+    sh_every: int = 1_000  # one degree more each, from the start of the stage
+    specular_reset: bool = True  # decision 25: at resets of the base set k_s becomes min(k_s, initial)
+    cells: int = 32  # per axis of the box: stratified random points (16 at 256x192: kernels.md)
+    per_cell: int = 5
+    # The points' box reaches at least so far from its middle on every axis, times the extent; 0 = as it is.
+    # EnvGS's boxes reach 3.8 (spheres), 2.7 (toycar), 4.2 and 1.9 (sedan) extents.
+    box_reach: float = 2.0
+    box_half: float = 0.0  # half side of a cube around the origin; 0 = box of the points (EnvGS: 20 for two scenes)
+    # Colours the set starts with, and what rays see that leave it: "random", "black" (EnvGS), or of the training images
+    # the "mean" or what a tenth of the pixels exceed ("bright"). Where they are darker than a sky, k_s falls there.
+    init_color: str = "random"
+    background: str = "black"
+    offset: float = 1e-4  # of the mirror ray's start, times the extent (method.md 6.3; EnvGS 0)
+    smallest_alpha: float = 1e-2  # pixels with less coverage have no surface to reflect at
+    rebuild_every: int = 100  # steps between new trees; in between the tree is refitted (kernels.md)
+    # Times the rates of colours and scales: the set starts from noise when the base set is half done.
+    rate_gain: float = 1.0
+    transmittance_cutoff: float = 1e-4
+    alpha_cutoff: float = 1 / 255
+    direction_gradient: str = "full"  # decision 24; "last_sh": what EnvGS's public tracer returns
+    # Register row 23, of every traced colour: at unit directions, or "raw": rays keep the camera ray's length (EnvGS).
+    sh_direction: str = "unit"
+    propagation: PropagationSettings = field(default_factory=PropagationSettings)
+    traced: TracedShareSettings = field(default_factory=TracedShareSettings)
+    matte: MatteSettings = field(default_factory=MatteSettings)
+    init: InitSettings = field(default_factory=InitSettings)
+    density: DensitySettings = field(default_factory=_reflection_density)
+
+    def __post_init__(self) -> None:
+        refuse_bad_numbers(self, "method.reflection")
+        for name in ("start", "densify_until"):
+            value = getattr(self, name)
+            refuse_unless(0 <= value <= 1, f"method.reflection.{name}", value, "between 0 and 1")
+        for name in ("densify_every", "sh_every", "cells", "per_cell", "rebuild_every"):
+            value = getattr(self, name)
+            refuse_unless(value >= 1, f"method.reflection.{name}", value, "at least 1")
+        every = self.opacity_reset_every
+        refuse_unless(every >= 0, "method.reflection.opacity_reset_every", every, "at least 0 (0: never)")
+        kind = self.direction_gradient
+        legal = kind in ("full", "last_sh")
+        refuse_unless(legal, "method.reflection.direction_gradient", kind, "full or last_sh")
+        kind = self.sh_direction
+        refuse_unless(kind in ("unit", "raw"), "method.reflection.sh_direction", kind, "unit or raw")
+        for name, first in (("init_color", "random"), ("background", "black")):
+            value = getattr(self, name)
+            legal = (first, "mean", "bright")
+            refuse_unless(value in legal, f"method.reflection.{name}", value, " or ".join(legal))
+
+
+@dataclass(frozen=True)
+class InterfaceSettings:
+    """Opaque surfels on the transparent object's mesh: the surface that photos alone do not form (glass.md).
+
+    They are rasterised with the base set, have its materials, and learn with it; rays that have entered the object do
+    not meet them.
+    """
+
+    count: int = 4_500  # surfels; 0 = none, as in the paper
+    opacity: float = 0.95  # initial
+    floor: float = 0.9  # opacities stay at or above it: photometric training erodes glass; no resets here
+    scale: float = 1.0  # times the distance to the neighbours
+    specular: float = 0.9  # initial k_s: L_spec's target
+    # With both and transmittance.max_gain 16, w_r starts near 0.8, bounded by transmittance.max_weight; f0 0.05 starts
+    # near 0.25 and ends as well (docs/transmittance.md).
+    f0: float = 0.15  # initial
+    roughness: float = 0.005  # initial
+    normal_loss: float = 0.2  # weight of 1 - n . N of the mesh in the masks; n as rasterised, so the base set bends too
+    # weight of the mean over the interface's surfels of 1 - n . n as put on the mesh: 0 = none (docs/transmittance.md)
+    normal_hold: float = field(default=0.0, metadata={"recipe": "unless default"})
+    normal_loss_until: float = 1.0  # share of the run for both; afterwards only reflections move the normals
+    masked_share: float = 0.5  # of the views in which a point of the mesh is the first surface: masked there in fewer
+    # than this share, it is no glass (a label, the lid that a hull puts on a cup) and gets no surfels
+
+    def __post_init__(self) -> None:
+        refuse_bad_numbers(self, "method.transmittance.interface")
+        refuse_unless(self.count >= 0, "method.transmittance.interface.count", self.count, "at least 0 (0: none)")
+        for name in ("opacity", "floor", "specular", "f0", "roughness"):
+            value = getattr(self, name)
+            refuse_unless(0 < value < 1, f"method.transmittance.interface.{name}", value, "between 0 and 1")
+        refuse_unless(
+            self.opacity >= self.floor, "method.transmittance.interface.opacity", self.opacity, f"at least {self.floor}"
+        )
+        refuse_unless(self.scale > 0, "method.transmittance.interface.scale", self.scale, "above 0")
+
+
+def _transmittance_init() -> InitSettings:
+    return InitSettings(scale=0.5)  # a quarter of the hits of each ray at the start
+
+
+_TRANSMITTANCE_CHOICES = {
+    "first_bounce": ("transmittance", "base", "none"),
+    "first_bounce_end": ("open", "clip"),
+    "second_bounce": ("mesh", "first_bounce", "none"),
+    "compositing": ("over", "sum"),
+    "first_surface": ("mesh", "base"),
+    "normal": ("base", "mesh"),
+    "box": ("object", "scene"),
+    "test_masks": ("silhouette", "given"),
+}
+
+
+@dataclass(frozen=True)
+class TransmittanceSettings:
+    """The third stage: straight rays through transparent objects (method.md 3.3, 4.4, 6.2, 6.3).
+
+    Of scenes with masks only. Boundaries are shares of the run, intervals are steps of the set's own clock, which
+    begins with the stage. The first choice of each key is this project's, the paper's way is named beside it.
+    """
+
+    enabled: bool = True  # False: the run ends after the second stage
+    start: float = 1 / 3  # share of the run: 20,000 of 60,000
+    first_bounce: str = "transmittance"  # decision 26: what it meets; "base": the base set inside; "none": nothing
+    first_bounce_end: str = "open"  # row 17, the paper relies on L_d; "clip": no hit counts behind the back surface
+    second_bounce: str = "mesh"  # row 27: begins at the mesh's back; "first_bounce": at z_s + Z_1; "none"
+    second_bounce_gradient: bool = True  # row 13: it teaches the base set
+    second_offset: float = 2.0  # row 14: it begins so many voxels behind the back surface
+    compositing: str = "over"  # row 12: C_1 + (1 - A_1) C_2; "sum": C_1 + C_2
+    first_surface: str = "mesh"  # where the object's pixels have their surface; the paper: "base", the rasterised depth
+    normal: str = "base"  # the rasterised normals there (of the interface, if there is one); "mesh": fixed, for tests
+    max_gain: float | None = None  # S_max in the object's pixels; None: optics.max_gain
+    # Both of the interface, without one (interface.count 0, the paper) neither acts: the largest w_r in the object's
+    # pixels, for an S_max of 16 alone lets its rim glow and darkens the set (0: none), and how many pixels around them
+    # get straight rays too, for interface surfels reach over the outline.
+    max_weight: float = 1.0
+    rim: int = 2
+    # Share of the masked pixels whose base depth is the object's first surface; with more the object is opaque and the
+    # stage left out (docs/transmittance.md: thin glass 0.05 to 0.5). 1: never.
+    opaque_share: float = 0.9
+    keep_seen: int = 3  # views that see a surfel bare, from which on it stays in the base set too; 0: all go
+    sh_degree: int = 3  # of the transmittance set, at most
+    split: bool = True  # base surfels inside the mesh become the transmittance set; the paper: a random set (False)
+    split_margin: float = 1.0  # voxels outside the mesh that still count as inside
+    box: str = "object"  # row 16, of a random set; "scene": the paper
+    cells: int = 32  # per axis of the box, as the reflection set
+    per_cell: int = 5
+    most_hits: float = 80.0  # of a ray through the random set: its surfels are shrunk until no more are expected
+    freeze_base: bool = True  # row 18: density control and resets of the base set end here; False: EnvGS's windows
+    test_masks: str = "silhouette"  # row 21: of the mesh, needs no mask at test views; "given": the scene's
+    offset: float = 1e-4  # of the first bounce's start, times the extent
+    opaque: float = 1 / 255  # no second bounce where the first leaves less light than this
+    densify_from: int = 500
+    densify_until: float = 2 / 3  # share of the run: 40,000 of 60,000
+    densify_every: int = 500
+    opacity_reset_every: int = 6_000  # 0 = never; only while densifying
+    sh_every: int = 1_000  # one degree more each; a set taken from the base keeps its degrees
+    rebuild_every: int = 100  # steps between new trees
+    rate_gain: float = 1.0  # as the reflection set's
+    transmittance_cutoff: float = 1e-4
+    alpha_cutoff: float = 1 / 255
+    interface: InterfaceSettings = field(default_factory=InterfaceSettings)
+    init: InitSettings = field(default_factory=_transmittance_init)
+    density: DensitySettings = field(default_factory=_reflection_density)
+
+    def __post_init__(self) -> None:
+        refuse_bad_numbers(self, "method.transmittance")
+        for name in ("start", "densify_until"):
+            value = getattr(self, name)
+            refuse_unless(0 <= value <= 1, f"method.transmittance.{name}", value, "between 0 and 1")
+        for name in ("densify_every", "sh_every", "cells", "per_cell", "rebuild_every", "most_hits"):
+            value = getattr(self, name)
+            refuse_unless(value >= 1, f"method.transmittance.{name}", value, "at least 1")
+        every = self.opacity_reset_every
+        refuse_unless(every >= 0, "method.transmittance.opacity_reset_every", every, "at least 0 (0: never)")
+        for name, choices in _TRANSMITTANCE_CHOICES.items():
+            value = getattr(self, name)
+            refuse_unless(value in choices, f"method.transmittance.{name}", value, " or ".join(choices))
+
+
+@dataclass(frozen=True)
+class MethodSettings:
+    """A method: which recipe, with which numbers. ``name`` selects the class in ``rtgs.methods``."""
+
+    name: str = "2dgs"
+    loss: LossSettings = field(default_factory=LossSettings)
+    optimizer: OptimizerSettings = field(default_factory=OptimizerSettings)
+    density: DensitySettings = field(default_factory=DensitySettings)
+    init: InitSettings = field(default_factory=InitSettings)
+    render: RenderSettings = field(default_factory=RenderSettings)
+    materials: MaterialSettings = field(default_factory=MaterialSettings)  # these three: methods with a second stage
+    optics: OpticsSettings = field(default_factory=OpticsSettings)
+    reflection: ReflectionSettings = field(default_factory=ReflectionSettings)
+    transmittance: TransmittanceSettings = field(default_factory=TransmittanceSettings)  # of rtgs
+    paper_schedule: ScheduleSettings = field(default_factory=ScheduleSettings)  # preset=paper takes this one
