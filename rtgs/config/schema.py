@@ -8,19 +8,20 @@ import typing
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from rtgs.core.refuse import refuse_unless
-from rtgs.mesh.settings import SOURCES, ObjectSettings, TsdfSettings
+from rtgs.core.refuse import refuse_unknown_words, words_of
+from rtgs.evaluate.publish import OWN_DATA, DataKind
+from rtgs.mesh.settings import MeshSource, ObjectSettings, TsdfSettings
 from rtgs.methods.settings import MethodSettings
 from rtgs.prepare.masks.settings import MaskSettings
 from rtgs.prepare.settings import NormalSettings, SfmSettings
 from rtgs.scenes.settings import SceneSettings
+from rtgs.track import TrackingKind
 from rtgs.train.settings import ScheduleSettings
 
 SCHEMA_NAME = "run_schema"
 _DOT = "__"  # in the names of twins
-MESH_OF = ("object", "scene")
 
 
 @dataclass(frozen=True)
@@ -54,12 +55,14 @@ class PathsConfig:
 class TrackingConfig:
     """Experiment tracking (``rtgs.track``)."""
 
-    kind: str = "mlflow"
-    """``off``, ``jsonl`` or ``mlflow``."""
+    kind: TrackingKind = "mlflow"
     uri: str = ""
     """MLflow tracking URI; empty: ``sqlite:///<paths.root>/mlflow.db``."""
     experiment: str = "rtgs/runs"
     """Experiment of the runs; executed steps go to ``rtgs/steps``."""
+
+    def __post_init__(self) -> None:
+        refuse_unknown_words(self, "tracking")
 
 
 @dataclass(frozen=True)
@@ -93,17 +96,16 @@ class MeshConfig:
     """0: expected depth (2DGS for meshes of real scenes), 1: median depth."""
     obj: bool = False
     """Also write an OBJ file."""
-    source: str = "auto"
+    source: MeshSource = "auto"
     """Of the transparent object's mesh, for the third stage: ``hull``, ``tsdf``, ``given`` or ``auto``."""
-    of: str = "object"
+    of: Literal["object", "scene"] = "object"
     """What the third stage's TSDF mesh is of: the masked ``object``, or the ``scene`` (decision 15)."""
     object: ObjectSettings = field(default_factory=ObjectSettings)
     """How that mesh is found."""
     tsdf: TsdfSettings = field(default_factory=TsdfSettings)
 
     def __post_init__(self) -> None:
-        for key, (value, allowed) in {"source": (self.source, SOURCES), "of": (self.of, MESH_OF)}.items():
-            refuse_unless(value in allowed, f"mesh.{key}", value, " or ".join(allowed))
+        refuse_unknown_words(self, "mesh")
 
 
 @dataclass(frozen=True)
@@ -113,10 +115,13 @@ class TableConfig:
     name: str = ""
     """Folder under ``<root>/tables``, the preset is added. Empty: no table is written."""
     title: str = ""
-    data: str = "own"
+    data: DataKind = OWN_DATA
     """``stand_in`` (scenes named after the paper's), ``paper`` (its data: differences are formed) or ``own``."""
     paper_scenes: dict[str, str] = field(default_factory=dict)
     """The paper's name of a scene by ours, where they differ."""
+
+    def __post_init__(self) -> None:
+        refuse_unknown_words(self, "table")
 
 
 @dataclass(frozen=True)
@@ -168,7 +173,7 @@ def _twin(cls: type) -> type:
     hints = typing.get_type_hints(cls)
     fields: list[Any] = []
     for item in dataclasses.fields(cls):
-        hint = hints[item.name]
+        hint = _open_hint(hints[item.name])
         if dataclasses.is_dataclass(hint):
             twin = _twin(typing.cast(type, hint))
             default = dataclasses.field(default_factory=_defaults(item, twin))
@@ -179,6 +184,15 @@ def _twin(cls: type) -> type:
     twin = dataclasses.make_dataclass(cls.__name__, fields)
     twin.__module__, twin.__qualname__ = __name__, f"{cls.__module__}.{cls.__qualname__}".replace(".", _DOT)
     return twin
+
+
+def _open_hint(hint: Any) -> Any:
+    """``str`` for a ``Literal`` of words, which OmegaConf does not know: :func:`rtgs.core.build.build` checks them."""
+    words = words_of(hint)
+    if not words:
+        return hint
+    plain = type(words[0])
+    return plain | None if type(None) in typing.get_args(hint) else plain
 
 
 def __getattr__(name: str) -> type:

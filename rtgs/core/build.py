@@ -6,45 +6,45 @@ import dataclasses
 import types
 import typing
 from collections.abc import Mapping, Sequence
-from functools import cache
 from typing import Any
 
 from rtgs.core.errors import RtgsError
+from rtgs.core.recipe import left_out_at
+from rtgs.core.refuse import hints_of, refuse_unknown
 
 
-def build(cls: type, values: Mapping[str, Any]) -> Any:
+def build(cls: type, values: Mapping[str, Any], where: str = "") -> Any:
     """An instance of the dataclass ``cls`` from plain containers; absent keys take their defaults.
 
+    Those that a recipe leaves out at one value (:mod:`rtgs.core.recipe`) take that value: an absent key means it.
+    ``where``: dotted key of ``values`` in the whole, for messages.
+
     Raises:
-        RtgsError: a key that ``cls`` does not have.
+        RtgsError: a key that ``cls`` does not have, or a word that is none of those its ``Literal`` allows.
     """
-    hints = _hints(cls)
+    hints = hints_of(cls)
     unknown = sorted(set(values) - set(hints))
     if unknown:
         raise RtgsError(f"config: {cls.__name__} has no key {', '.join(unknown)}; it has {', '.join(hints)}")
-    return cls(
-        **{
-            item.name: _value(hints[item.name], values[item.name])
-            for item in dataclasses.fields(cls)
-            if item.name in values
-        }
-    )
+    made: dict[str, Any] = {}
+    for item in dataclasses.fields(cls):
+        if item.name in values:
+            made[item.name] = _value(hints[item.name], values[item.name], f"{where}.{item.name}".lstrip("."))
+        elif (meant := left_out_at(item)) is not dataclasses.MISSING:
+            made[item.name] = meant
+    return cls(**made)
 
 
-@cache
-def _hints(cls: type) -> dict[str, Any]:
-    return typing.get_type_hints(cls)
-
-
-def _value(hint: Any, value: Any) -> Any:
+def _value(hint: Any, value: Any, where: str) -> Any:
+    refuse_unknown(where, value, hint)
     if value is None:
         return None
     if dataclasses.is_dataclass(hint):
-        return build(typing.cast(type, hint), value)
+        return build(typing.cast(type, hint), value, where)
     if isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union:
         (inner,) = [part for part in typing.get_args(hint) if part is not type(None)]
-        return _value(inner, value)
+        return _value(inner, value, where)
     if typing.get_origin(hint) is tuple:
         item = typing.get_args(hint)[0]
-        return tuple(_value(item, each) for each in typing.cast(Sequence[Any], value))
+        return tuple(_value(item, each, where) for each in typing.cast(Sequence[Any], value))
     return value

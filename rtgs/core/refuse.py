@@ -1,9 +1,15 @@
-"""What settings refuse, in one wording: the key, the value, the legal range."""
+"""What settings refuse, in one wording: the key, the value, what is legal."""
 
 from __future__ import annotations
 
+import difflib
 import math
+import types
+import typing
 from dataclasses import fields
+from functools import cache
+
+from rtgs.core.errors import RtgsError
 
 
 def refuse_bad_numbers(settings: object, where: str) -> None:
@@ -22,3 +28,42 @@ def refuse_unless(legal: bool, key: str, value: object, allowed: str) -> None:
     """Raise ValueError naming the key unless its value is legal."""
     if not legal:
         raise ValueError(f"{key}={value} must be {allowed}")
+
+
+def refuse_unknown_words(settings: object, where: str) -> None:
+    """Every field of a settings object that is annotated as ``Literal`` must hold one of its words.
+
+    Raises:
+        RtgsError: as :func:`refuse_unknown`, with the key ``<where>.<field>``.
+    """
+    for name, hint in hints_of(type(settings)).items():
+        refuse_unknown(f"{where}.{name}", getattr(settings, name), hint)
+
+
+def refuse_unknown(key: str, value: object, hint: object) -> None:
+    """Refuse a value that is none of the words of ``hint``; a hint that is no ``Literal`` allows everything.
+
+    Raises:
+        RtgsError: names the key, the value, the words, and the nearest of them.
+    """
+    known = words_of(hint)
+    if not known or value in known or (value is None and type(None) in typing.get_args(hint)):
+        return
+    close = difflib.get_close_matches(str(value), [str(word) for word in known], n=1)
+    advice = f"; did you mean {close[0]!r}?" if close else ""
+    raise RtgsError(f"{key}={value!r} is unknown: choose one of {', '.join(map(str, known))}{advice}")
+
+
+def words_of(hint: object) -> tuple[str | int, ...]:
+    """What ``Literal["a", "b"]`` or ``Literal["a", "b"] | None`` allows besides None; empty for another annotation."""
+    if typing.get_origin(hint) is typing.Literal:
+        return typing.get_args(hint)
+    if isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union:
+        return tuple(word for part in typing.get_args(hint) for word in words_of(part))
+    return ()
+
+
+@cache
+def hints_of(cls: type) -> dict[str, typing.Any]:
+    """The resolved annotations of a dataclass."""
+    return typing.get_type_hints(cls)

@@ -5,13 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
+from rtgs.core.refuse import refuse_unknown_words
 from rtgs.evaluate.records import EvaluationTable
 from rtgs.evaluate.tables import PAPER_SCORES, PaperScore
 
-STAND_IN, PAPER_DATA, OWN_DATA = "stand_in", "paper", "own"
+DataKind = Literal["stand_in", "paper", "own"]
+STAND_IN: DataKind = "stand_in"
+PAPER_DATA: DataKind = "paper"
+OWN_DATA: DataKind = "own"
 PAPER_PRESET = "paper"  # the preset that is the published schedule
-DATA_KINDS = (STAND_IN, PAPER_DATA, OWN_DATA)
 
 
 @dataclass(frozen=True)
@@ -20,11 +24,10 @@ class TableSpec:
 
     name: str  # also the folder it is written into
     title: str
-    data: str = OWN_DATA  # one of DATA_KINDS
+    data: DataKind = OWN_DATA
 
     def __post_init__(self) -> None:
-        if self.data not in DATA_KINDS:
-            raise ValueError(f"table.data={self.data!r} is unknown: choose one of {', '.join(DATA_KINDS)}")
+        refuse_unknown_words(self, "table")
 
 
 @dataclass(frozen=True)

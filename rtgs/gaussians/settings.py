@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
-from rtgs.core.refuse import refuse_bad_numbers, refuse_unless
+from rtgs.core.refuse import refuse_bad_numbers, refuse_unknown_words, refuse_unless
+
+DensityStrategy = Literal["adaptive", "mcmc"]
+RoughnessCurve = Literal["log", "linear"]
 
 
 @dataclass(frozen=True)
@@ -51,9 +55,6 @@ class OptimizerSettings:
         return replace(self, **{name: gain * getattr(self, name) for name in names})
 
 
-DENSITY_STRATEGIES = ("adaptive", "mcmc")
-
-
 @dataclass(frozen=True)
 class McmcSettings:
     """Densification as Markov chain Monte Carlo (Kheradmand et al. 2024), whose fixed budget is the cap."""
@@ -82,7 +83,7 @@ class McmcSettings:
 class DensitySettings:
     """Density control (method.md 6.1, 12)."""
 
-    strategy: str = "adaptive"  # or "mcmc": N grows to the cap and stays; no signal, no opacity resets
+    strategy: DensityStrategy = "adaptive"  # "mcmc": N grows to the cap and stays; no signal, no opacity resets
     gradient_threshold: float = 2e-4  # mean norm of the densification signal (NDC)
     size_border: float = 0.01  # times extent: larger surfels split, smaller ones clone
     split_count: int = 2
@@ -107,9 +108,7 @@ class DensitySettings:
     mcmc: McmcSettings = field(default_factory=McmcSettings)
 
     def __post_init__(self) -> None:
-        if self.strategy not in DENSITY_STRATEGIES:
-            known = ", ".join(DENSITY_STRATEGIES)
-            raise ValueError(f"method.density.strategy={self.strategy!r} must be one of {known}")
+        refuse_unknown_words(self, "method.density")
         if self.max_per_pixel is not None:
             refuse_unless(self.max_per_pixel > 0, "density.max_per_pixel", self.max_per_pixel, "above 0, or null")
 
@@ -124,14 +123,16 @@ class MaterialSettings:
     # ray is darker than what it replaces, and k_s falls before the reflection set has learned (docs/reflection.md).
     roughness: float = 0.002
     f0: float = 0.9
-    f0_channels: int = 1  # decision 6: the paper writes a scalar; 3 = rgb
-    roughness_curve: str = "log"  # roughness = floor^(1 - sigmoid(raw)); "linear": floor + (1 - floor) sigmoid(raw)
+    f0_channels: Literal[1, 3] = 1  # decision 6: the paper writes a scalar; 3 = rgb
+    # "log": roughness = floor^(1 - sigmoid(raw)); "linear": floor + (1 - floor) sigmoid(raw)
+    roughness_curve: RoughnessCurve = "log"
     roughness_floor: float = 1e-3  # method.md 4.2: without it the remap turns round
     normalized: bool = True  # decision 8: roughness and f0 maps are divided by the accumulated alpha, k_s is not
     smallest_alpha: float = 1e-3  # the least they are divided by
 
     def __post_init__(self) -> None:
         refuse_bad_numbers(self, "method.materials")
+        refuse_unknown_words(self, "method.materials")
         for name in ("specular", "f0"):
             value = getattr(self, name)
             refuse_unless(0 < value < 1, f"method.materials.{name}", value, "between 0 and 1")
@@ -139,9 +140,4 @@ class MaterialSettings:
         refuse_unless(0 < floor < 1, "method.materials.roughness_floor", floor, "between 0 and 1")
         refuse_unless(
             floor < self.roughness < 1, "method.materials.roughness", self.roughness, f"between {floor} and 1"
-        )
-        refuse_unless(self.f0_channels in (1, 3), "method.materials.f0_channels", self.f0_channels, "1 or 3")
-        curves = ("log", "linear")
-        refuse_unless(
-            self.roughness_curve in curves, "method.materials.roughness_curve", self.roughness_curve, "log or linear"
         )

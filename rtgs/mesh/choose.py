@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from rtgs.core.errors import RtgsError
+from rtgs.core.refuse import refuse_unknown
 from rtgs.mesh.container import ObjectMesh
 from rtgs.mesh.hull import HullResult, carve_hull
 from rtgs.mesh.pane import drawn_pane, fit_pane, is_flat
-from rtgs.mesh.settings import SOURCES, ObjectSettings
+from rtgs.mesh.settings import MeshSource, ObjectSettings
 from rtgs.mesh.silhouettes import MaskSet, SilhouetteScore, direction_spread, silhouette_score
 from rtgs.mesh.smoothing import volume
 from rtgs.mesh.triangles import TriangleMesh, read_mesh_obj, read_mesh_ply
@@ -140,8 +141,7 @@ def choose_object_mesh(
     Raises:
         RtgsError: an unknown name, or no mesh can be made; with what was tried.
     """
-    if source not in SOURCES:
-        raise RtgsError(f"mesh.source is {source!r}: one of {', '.join(SOURCES)}")
+    refuse_unknown("mesh.source", source, MeshSource)
     tried = _Candidates(masks, settings, fuse, panes)
     make = {"hull": _hull_or_pane, "auto": _automatic}.get(source, lambda found: getattr(found, _MADE[source])())
     try:

@@ -6,11 +6,11 @@ Without torch: a plan is made from the cache alone, and reading the schema is pa
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
-from rtgs.core.refuse import refuse_bad_numbers, refuse_unless
+from rtgs.core.refuse import refuse_bad_numbers, refuse_unknown_words, refuse_unless
 
-SOURCES = ("auto", "hull", "tsdf", "given")
-FLAT = ("auto", "yes", "no")
+MeshSource = Literal["auto", "hull", "tsdf", "given"]
 COVERED = 0.999  # share of the picture from which on a mask says that everything is the object
 AUTOMATIC = -1  # of HullSettings.outvoted
 
@@ -91,7 +91,7 @@ class ObjectSettings:
     """Path of a PLY or OBJ file in the capture's world frame, for ``mesh.source=given``."""
     given_sha256: str = ""
     """Of that file; set when the run is planned, so that another file makes the step run again."""
-    flat: str = "auto"
+    flat: Literal["auto", "yes", "no"] = "auto"
     """A pane of glass: one wall, nothing inside. ``yes``, ``no``, or ``auto``: whether one plane explains the masks."""
     accept: float = 0.95
     """Silhouette IoU from which on ``auto`` takes the hull without making a TSDF mesh to compare it with."""
@@ -106,7 +106,7 @@ class ObjectSettings:
 
     def __post_init__(self) -> None:
         refuse_bad_numbers(self, "mesh.object")
-        refuse_unless(self.flat in FLAT, "mesh.object.flat", self.flat, " or ".join(FLAT))
+        refuse_unknown_words(self, "mesh.object")
         for name in ("accept", "tsdf_accept"):
             value = getattr(self, name)
             refuse_unless(value <= 1, f"mesh.object.{name}", value, "between 0 and 1")

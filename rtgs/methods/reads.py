@@ -5,14 +5,18 @@ from __future__ import annotations
 from dataclasses import replace
 
 from rtgs.gaussians.settings import MaterialSettings, OptimizerSettings
-from rtgs.methods.settings import MethodSettings, ReflectionSettings, TransmittanceSettings
+from rtgs.methods.settings import InterfaceSettings, MethodSettings, ReflectionSettings, TransmittanceSettings
 from rtgs.optics.settings import OpticsSettings
 from rtgs.train.settings import LossSettings
 
 _SECOND_STAGE_LOSSES = ("perceptual", "specular")
 _THIRD_STAGE_LOSSES = ("transmission_depth",)
 _MATERIAL_RATES = ("specular_logits", "roughness_logits", "f0_logits")
-_UNREAD = TransmittanceSettings(enabled=False)
+# What recipes of the stages before the third spell for these settings, which they do not read. It is what the defaults
+# once were, and stays when they change: else all those artifacts would be made again.
+_UNREAD = TransmittanceSettings(
+    enabled=False, max_gain=None, interface=InterfaceSettings(normal_loss=0.2, normal_hold=0.0)
+)
 
 
 def diffuse_alone(settings: MethodSettings) -> MethodSettings:

@@ -6,8 +6,9 @@ Boundaries are shares of the run (``schedule.total``), intervals are steps.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
-from rtgs.core.refuse import refuse_bad_numbers, refuse_unless
+from rtgs.core.refuse import refuse_bad_numbers, refuse_unknown_words, refuse_unless
 from rtgs.gaussians.settings import DensitySettings, InitSettings, MaterialSettings, OptimizerSettings
 from rtgs.optics.settings import OpticsSettings
 from rtgs.render.settings import RenderSettings
@@ -100,8 +101,8 @@ class ReflectionSettings:
     box_half: float = 0.0  # half side of a cube around the origin; 0 = box of the points (EnvGS: 20 for two scenes)
     # Colours the set starts with, and what rays see that leave it: "random", "black" (EnvGS), or of the training images
     # the "mean" or what a tenth of the pixels exceed ("bright"). Where they are darker than a sky, k_s falls there.
-    init_color: str = "random"
-    background: str = "black"
+    init_color: Literal["random", "mean", "bright"] = "random"
+    background: Literal["black", "mean", "bright"] = "black"
     offset: float = 1e-4  # of the mirror ray's start, times the extent (method.md 6.3; EnvGS 0)
     smallest_alpha: float = 1e-2  # pixels with less coverage have no surface to reflect at
     rebuild_every: int = 100  # steps between new trees; in between the tree is refitted (kernels.md)
@@ -109,9 +110,10 @@ class ReflectionSettings:
     rate_gain: float = 1.0
     transmittance_cutoff: float = 1e-4
     alpha_cutoff: float = 1 / 255
-    direction_gradient: str = "full"  # decision 24; "last_sh": what EnvGS's public tracer returns
-    # Register row 23, of every traced colour: at unit directions, or "raw": rays keep the camera ray's length (EnvGS).
-    sh_direction: str = "unit"
+    # Decision 24; "last_sh": what EnvGS's public tracer returns.
+    direction_gradient: Literal["full", "last_sh"] = "full"
+    # Decision 23, of every traced colour: at unit directions, or "raw": rays keep the camera ray's length (EnvGS).
+    sh_direction: Literal["unit", "raw"] = "unit"
     propagation: PropagationSettings = field(default_factory=PropagationSettings)
     traced: TracedShareSettings = field(default_factory=TracedShareSettings)
     matte: MatteSettings = field(default_factory=MatteSettings)
@@ -120,6 +122,7 @@ class ReflectionSettings:
 
     def __post_init__(self) -> None:
         refuse_bad_numbers(self, "method.reflection")
+        refuse_unknown_words(self, "method.reflection")
         for name in ("start", "densify_until"):
             value = getattr(self, name)
             refuse_unless(0 <= value <= 1, f"method.reflection.{name}", value, "between 0 and 1")
@@ -128,15 +131,6 @@ class ReflectionSettings:
             refuse_unless(value >= 1, f"method.reflection.{name}", value, "at least 1")
         every = self.opacity_reset_every
         refuse_unless(every >= 0, "method.reflection.opacity_reset_every", every, "at least 0 (0: never)")
-        kind = self.direction_gradient
-        legal = kind in ("full", "last_sh")
-        refuse_unless(legal, "method.reflection.direction_gradient", kind, "full or last_sh")
-        kind = self.sh_direction
-        refuse_unless(kind in ("unit", "raw"), "method.reflection.sh_direction", kind, "unit or raw")
-        for name, first in (("init_color", "random"), ("background", "black")):
-            value = getattr(self, name)
-            legal = (first, "mean", "bright")
-            refuse_unless(value in legal, f"method.reflection.{name}", value, " or ".join(legal))
 
 
 @dataclass(frozen=True)
@@ -156,9 +150,12 @@ class InterfaceSettings:
     # near 0.25 and ends as well (docs/transmittance.md).
     f0: float = 0.15  # initial
     roughness: float = 0.005  # initial
-    normal_loss: float = 0.2  # weight of 1 - n . N of the mesh in the masks; n as rasterised, so the base set bends too
-    # weight of the mean over the interface's surfels of 1 - n . n as put on the mesh: 0 = none (docs/transmittance.md)
-    normal_hold: float = field(default=0.0, metadata={"recipe": "unless default"})
+    # Weight of 1 - n . N of the mesh in the masks. 0 = none: n is as rasterised, and the base set with its labels and
+    # contents would bend too.
+    normal_loss: float = 0.0
+    # Weight of the mean over the interface's surfels of 1 - n . n as put on the mesh. 0 = none: normals that the mesh
+    # has right to 1 or 2 degrees end 4 off (docs/transmittance.md).
+    normal_hold: float = field(default=20.0, metadata={"recipe": "unless", "value": 0.0})
     normal_loss_until: float = 1.0  # share of the run for both; afterwards only reflections move the normals
     masked_share: float = 0.5  # of the views in which a point of the mesh is the first surface: masked there in fewer
     # than this share, it is no glass (a label, the lid that a hull puts on a cup) and gets no surfels
@@ -179,18 +176,6 @@ def _transmittance_init() -> InitSettings:
     return InitSettings(scale=0.5)  # a quarter of the hits of each ray at the start
 
 
-_TRANSMITTANCE_CHOICES = {
-    "first_bounce": ("transmittance", "base", "none"),
-    "first_bounce_end": ("open", "clip"),
-    "second_bounce": ("mesh", "first_bounce", "none"),
-    "compositing": ("over", "sum"),
-    "first_surface": ("mesh", "base"),
-    "normal": ("base", "mesh"),
-    "box": ("object", "scene"),
-    "test_masks": ("silhouette", "given"),
-}
-
-
 @dataclass(frozen=True)
 class TransmittanceSettings:
     """The third stage: straight rays through transparent objects (method.md 3.3, 4.4, 6.2, 6.3).
@@ -201,15 +186,21 @@ class TransmittanceSettings:
 
     enabled: bool = True  # False: the run ends after the second stage
     start: float = 1 / 3  # share of the run: 20,000 of 60,000
-    first_bounce: str = "transmittance"  # decision 26: what it meets; "base": the base set inside; "none": nothing
-    first_bounce_end: str = "open"  # row 17, the paper relies on L_d; "clip": no hit counts behind the back surface
-    second_bounce: str = "mesh"  # row 27: begins at the mesh's back; "first_bounce": at z_s + Z_1; "none"
-    second_bounce_gradient: bool = True  # row 13: it teaches the base set
-    second_offset: float = 2.0  # row 14: it begins so many voxels behind the back surface
-    compositing: str = "over"  # row 12: C_1 + (1 - A_1) C_2; "sum": C_1 + C_2
-    first_surface: str = "mesh"  # where the object's pixels have their surface; the paper: "base", the rasterised depth
-    normal: str = "base"  # the rasterised normals there (of the interface, if there is one); "mesh": fixed, for tests
-    max_gain: float | None = None  # S_max in the object's pixels; None: optics.max_gain
+    # Decision 26: what it meets; "base": the base set inside; "none": nothing.
+    first_bounce: Literal["transmittance", "base", "none"] = "transmittance"
+    # Decision 17: the paper relies on L_d; "clip": no hit counts behind the back surface.
+    first_bounce_end: Literal["open", "clip"] = "open"
+    # Decision 27: begins at the mesh's back; "first_bounce": at z_s + Z_1; "none".
+    second_bounce: Literal["mesh", "first_bounce", "none"] = "mesh"
+    second_bounce_gradient: bool = True  # decision 13: it teaches the base set
+    second_offset: float = 2.0  # decision 14: it begins so many voxels behind the back surface
+    compositing: Literal["over", "sum"] = "over"  # decision 12: C_1 + (1 - A_1) C_2; "sum": C_1 + C_2
+    # Where the object's pixels have their surface; the paper: "base", the rasterised depth.
+    first_surface: Literal["mesh", "base"] = "mesh"
+    # The rasterised normals there (of the interface, if there is one); "mesh": fixed, for tests.
+    normal: Literal["base", "mesh"] = "base"
+    # S_max in the object's pixels, whose f0 stays low; None: optics.max_gain. w_r is bounded by max_weight.
+    max_gain: float | None = 16.0
     # Both of the interface, without one (interface.count 0, the paper) neither acts: the largest w_r in the object's
     # pixels, for an S_max of 16 alone lets its rim glow and darkens the set (0: none), and how many pixels around them
     # get straight rays too, for interface surfels reach over the outline.
@@ -222,12 +213,13 @@ class TransmittanceSettings:
     sh_degree: int = 3  # of the transmittance set, at most
     split: bool = True  # base surfels inside the mesh become the transmittance set; the paper: a random set (False)
     split_margin: float = 1.0  # voxels outside the mesh that still count as inside
-    box: str = "object"  # row 16, of a random set; "scene": the paper
+    box: Literal["object", "scene"] = "object"  # decision 16, of a random set; "scene": the paper
     cells: int = 32  # per axis of the box, as the reflection set
     per_cell: int = 5
     most_hits: float = 80.0  # of a ray through the random set: its surfels are shrunk until no more are expected
-    freeze_base: bool = True  # row 18: density control and resets of the base set end here; False: EnvGS's windows
-    test_masks: str = "silhouette"  # row 21: of the mesh, needs no mask at test views; "given": the scene's
+    freeze_base: bool = True  # decision 18: density control and resets of the base set end here; False: EnvGS's windows
+    # Decision 21: of the mesh, needs no mask at test views; "given": the scene's.
+    test_masks: Literal["silhouette", "given"] = "silhouette"
     offset: float = 1e-4  # of the first bounce's start, times the extent
     opaque: float = 1 / 255  # no second bounce where the first leaves less light than this
     densify_from: int = 500
@@ -245,6 +237,7 @@ class TransmittanceSettings:
 
     def __post_init__(self) -> None:
         refuse_bad_numbers(self, "method.transmittance")
+        refuse_unknown_words(self, "method.transmittance")
         for name in ("start", "densify_until"):
             value = getattr(self, name)
             refuse_unless(0 <= value <= 1, f"method.transmittance.{name}", value, "between 0 and 1")
@@ -253,9 +246,6 @@ class TransmittanceSettings:
             refuse_unless(value >= 1, f"method.transmittance.{name}", value, "at least 1")
         every = self.opacity_reset_every
         refuse_unless(every >= 0, "method.transmittance.opacity_reset_every", every, "at least 0 (0: never)")
-        for name, choices in _TRANSMITTANCE_CHOICES.items():
-            value = getattr(self, name)
-            refuse_unless(value in choices, f"method.transmittance.{name}", value, " or ".join(choices))
 
 
 @dataclass(frozen=True)

@@ -4,36 +4,36 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Literal
 
-WEIGHTS = ("microfacet", "literal", "split_sum", "envgs")
-REMAPS = ("pbrt", "none")
-MASKINGS = ("correlated", "separable")
-BLENDS = ("srgb", "linear")
+from rtgs.core.refuse import refuse_unknown_words
+
+Weight = Literal["microfacet", "literal", "split_sum", "envgs"]
+Remap = Literal["pbrt", "none"]
+Masking = Literal["correlated", "separable"]
+Blend = Literal["srgb", "linear"]
 
 
 @dataclass(frozen=True)
 class OpticsSettings:
     """The weights in front of the traced colours (method.md 4.2 to 4.4; decisions 1 to 5)."""
 
-    weight: str = (
-        "microfacet"  # or "literal" (paper's blend without the cosine), "split_sum" (its ablation), "envgs" (1)
-    )
+    # "literal": the paper's blend without the cosine; "split_sum": its ablation; "envgs": 1
+    weight: Weight = "microfacet"
     # S_max, bound of the microfacet gain: 1 conserves energy and is nearly the same from all angles, 0 = no bound (the
     # paper), 16 = method.md 4.4; chosen in docs/reflection.md.
     max_gain: float = 1.0
-    remap: str = "pbrt"  # width g(alpha) of the paper, once squared in D and G; "none": g = alpha
+    remap: Remap = "pbrt"  # width g(alpha) of the paper, once squared in D and G; "none": g = alpha
     roughness_floor: float = 1e-3  # argument of g (PBRT): below 1.55e-4 the remap turns round
-    masking: str = "correlated"  # height-correlated Smith; "separable": product of two G1
+    masking: Masking = "correlated"  # height-correlated Smith; "separable": product of two G1
     cosine_floor: float = 1e-3  # of n . omega_o
     literal_cosine_floor: float = 0.1  # the same for "literal", which divides by it
     detach_cosine: bool = False  # keep the weight's gradient away from the normal
     # In which light C_d, C_r and C_t are mixed: their sRGB encoding, as the paper, or linear light (glass.md).
-    blend: str = field(default="srgb", metadata={"recipe": "unless default"})
+    blend: Blend = field(default="srgb", metadata={"recipe": "unless default"})
 
     def __post_init__(self) -> None:
-        for name, legal in (("weight", WEIGHTS), ("remap", REMAPS), ("masking", MASKINGS), ("blend", BLENDS)):
-            if getattr(self, name) not in legal:
-                raise ValueError(f"method.optics.{name} is {getattr(self, name)!r}: choose one of {', '.join(legal)}")
+        refuse_unknown_words(self, "method.optics")
         if not (self.max_gain >= 0 and math.isfinite(self.max_gain)):
             raise ValueError(
                 f"method.optics.max_gain={self.max_gain} must be a finite number of at least 0 (0: no bound)"

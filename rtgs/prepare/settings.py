@@ -6,14 +6,17 @@ Numbers without a source are COLMAP's defaults (``pycolmap.IncrementalPipelineOp
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
-from rtgs.prepare.errors import PrepareError, check_choice
-from rtgs.prepare.normals.adapters import ADAPTERS, NormalAdapter
+from rtgs.core.refuse import refuse_unknown_words
+from rtgs.prepare.errors import PrepareError
+from rtgs.prepare.normals.adapters import ADAPTERS, NormalAdapter, NormalNetwork
 
-USE = ("auto", "always", "never")
-MATCHING = ("auto", "exhaustive", "sequential", "retrieval")
-MAPPERS = ("incremental", "global")
-FEATURES = ("sift", "aliked_n16rot", "aliked_n32")
+Use = Literal["auto", "always", "never"]
+FeatureKind = Literal["sift", "aliked_n16rot", "aliked_n32"]
+Pairs = Literal["auto", "exhaustive", "sequential", "retrieval"]
+Mapper = Literal["incremental", "global"]
+NormalModel = Literal[NormalNetwork, "custom"]
 
 
 @dataclass(frozen=True)
@@ -41,7 +44,7 @@ class VideoSettings:
 class FeatureSettings:
     """Keypoints and descriptors."""
 
-    kind: str = "sift"
+    kind: FeatureKind = "sift"
     """``sift``; ``aliked_n16rot`` and ``aliked_n32`` need COLMAP's model files on this machine."""
     max_side: int = 1600
     """Photos are shrunk to it for the search (COLMAP's quality "medium"; 2400 is "high")."""
@@ -51,12 +54,15 @@ class FeatureSettings:
     peak_threshold: float = 0.0067
     """Contrast below which a SIFT keypoint does not count; lower finds more on plain walls."""
 
+    def __post_init__(self) -> None:
+        refuse_unknown_words(self, "sfm.features")
+
 
 @dataclass(frozen=True)
 class MatchingSettings:
     """Which photos are compared, and how strictly."""
 
-    pairs: str = "auto"
+    pairs: Pairs = "auto"
     """``exhaustive`` every pair; ``sequential`` neighbours in order, for videos; ``retrieval`` the most similar ones.
     ``auto``: exhaustive up to ``exhaustive_up_to`` photos, beyond it sequential for a video, retrieval for photos."""
     exhaustive_up_to: int = 120
@@ -74,12 +80,15 @@ class MatchingSettings:
     ransac_error: float = 4.0
     """Pixels."""
 
+    def __post_init__(self) -> None:
+        refuse_unknown_words(self, "sfm.matching")
+
 
 @dataclass(frozen=True)
 class MappingSettings:
     """From matches to poses and points."""
 
-    mapper: str = "incremental"
+    mapper: Mapper = "incremental"
     """``incremental``, or ``global`` (GLOMAP): faster on many photos, less patient with few or weak matches."""
     camera_model: str = "SIMPLE_RADIAL"
     """COLMAP's name; one camera per picture size and EXIF focal length."""
@@ -109,6 +118,9 @@ class MappingSettings:
     threads: int = 1
     """Of the mapper. One keeps results the same on every machine; large bundle adjustments gain from more."""
 
+    def __post_init__(self) -> None:
+        refuse_unknown_words(self, "sfm.mapping")
+
 
 @dataclass(frozen=True)
 class WorldSettings:
@@ -131,7 +143,7 @@ class SfmSettings:
         PrepareError: a value outside its documented range.
     """
 
-    use: str = "auto"
+    use: Use = "auto"
     """``auto``: where the capture has no poses. ``always``: also where it has. ``never``: one without is refused."""
     features: FeatureSettings = field(default_factory=FeatureSettings)
     matching: MatchingSettings = field(default_factory=MatchingSettings)
@@ -152,13 +164,7 @@ class SfmSettings:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for key, value, known in (
-            ("use", self.use, USE),
-            ("features.kind", self.features.kind, FEATURES),
-            ("matching.pairs", self.matching.pairs, MATCHING),
-            ("mapping.mapper", self.mapping.mapper, MAPPERS),
-        ):
-            check_choice(f"sfm.{key}", value, known)
+        refuse_unknown_words(self, "sfm")
         for key, value, least in (
             ("features.max_side", self.features.max_side, 64),
             ("features.max_features", self.features.max_features, 100),
@@ -187,10 +193,10 @@ class NormalSettings:
         PrepareError: a value outside its documented range.
     """
 
-    use: str = "auto"
+    use: Use = "auto"
     """``auto``: where a loss of the method reads them, none are given, and the network's file is there. ``always``:
     also without such a loss or in place of given ones, and a missing file is an error. ``never``."""
-    model: str = "stablenormal"
+    model: NormalModel = "stablenormal"
     """``stablenormal``, ``dsine``, ``omnidata``, ``metric3d`` (:mod:`rtgs.prepare.normals.adapters` declares what their
     numbers mean), or ``custom``: as ``adapter`` says."""
     file: str = ""
@@ -214,8 +220,7 @@ class NormalSettings:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "axes", tuple(self.axes))
-        check_choice("normals.use", self.use, USE)
-        check_choice("normals.model", self.model, (*ADAPTERS, "custom"))
+        refuse_unknown_words(self, "normals")
         if self.model == "custom" and not self.file:
             raise PrepareError("setting normals.model=custom needs normals.file, the ONNX file")
         if not self.max_side >= 32:

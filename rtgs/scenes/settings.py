@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from dataclasses import dataclass
+from typing import Literal
 
-FORMATS = ("auto", "colmap", "transforms", "blender")
-POINT_SOURCES = ("auto", "random")
-NORMAL_FRAMES = ("opencv", "opengl")
+from rtgs.core.refuse import refuse_unknown_words
+
+CaptureFormat = Literal["auto", "colmap", "transforms", "blender"]
+NormalFrame = Literal["opencv", "opengl"]
 
 
 class CaptureError(ValueError):
@@ -20,14 +21,15 @@ class SceneSettings:
     """Import settings of one capture. Every relative path is relative to ``path``.
 
     Raises:
-        CaptureError: a value outside its documented range (a misspelt format, a negative size).
+        CaptureError: a value outside its documented range (a negative size).
+        RtgsError: a word that is none of those to choose from (a misspelt format).
     """
 
     name: str = "scene"
     """Name of the scene in tables, folders and logs."""
     path: str = ""
     """Folder of the capture, or ``embedded:<name>`` for a capture shipped with rtgs."""
-    format: str = "auto"
+    format: CaptureFormat = "auto"
     """``colmap``, ``transforms`` (nerfstudio), ``blender`` (synthetic), or ``auto``: the first of the three found."""
     long_side: int | None = None
     """Long side of the views in pixels, reached by area averaging; never enlarged. None: the photo's own size."""
@@ -48,14 +50,14 @@ class SceneSettings:
     Empty string: ignore masks."""
     normals_dir: str = "normals"
     """Folder of ``<image stem>.png`` (2 rgb - 1) or ``.npy`` ((H, W, 3)) camera-frame normals. Empty string: ignore."""
-    normals_frame: str = "opencv"
+    normals_frame: NormalFrame = "opencv"
     """Axes of the stored normals: ``opencv`` x right, y down, z forward (rtgs's own) or ``opengl`` x right, y up,
     z backward."""
     max_views: int | None = None
     """At most this many views, spread evenly over name order, chosen before the split. None: all."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Colour (0..1) behind images with an alpha channel; use the renderer's background."""
-    points: str = "auto"
+    points: Literal["auto", "random"] = "auto"
     """``auto``: the capture's points, random ones where the format carries none (Blender, transforms.json without a
     point file); a COLMAP model without points is refused. ``random``: random points always."""
     random_points: int = 20_000
@@ -79,9 +81,7 @@ class SceneSettings:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "background", tuple(float(c) for c in self.background))
-        _check_choice("format", self.format, FORMATS)
-        _check_choice("points", self.points, POINT_SOURCES)
-        _check_choice("normals_frame", self.normals_frame, NORMAL_FRAMES)
+        refuse_unknown_words(self, "scene")
         if len(self.background) != 3 or not all(0 <= c <= 1 for c in self.background):
             raise CaptureError(f"scene setting background={self.background}: give three numbers between 0 and 1")
         if self.resize_ratio is not None and not 0 < self.resize_ratio <= 1:
@@ -91,14 +91,6 @@ class SceneSettings:
         for field_name in ("split_every", "min_points", "min_track_length", "near_camera", "far_factor"):
             _check_least(field_name, getattr(self, field_name), 0)
         _check_least("random_points", self.random_points, 1)
-
-
-def _check_choice(field_name: str, value: str, choices: tuple[str, ...]) -> None:
-    if value in choices:
-        return
-    close = difflib.get_close_matches(value, choices, n=1)
-    hint = f"; did you mean {close[0]!r}?" if close else ""
-    raise CaptureError(f"scene setting {field_name}={value!r} is unknown: choose one of {', '.join(choices)}{hint}")
 
 
 def _check_least(field_name: str, value: float | None, least: float) -> None:

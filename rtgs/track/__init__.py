@@ -6,15 +6,18 @@ Tracking records; it never decides what runs. Importing this package imports no 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
-from rtgs.core.errors import RtgsError
+from rtgs.core.refuse import refuse_unknown
 from rtgs.track.null import NullTracker, NullTracking
 from rtgs.track.protocol import RunInfo, Tracker, Tracking
 
-__all__ = ["NullTracker", "NullTracking", "RunInfo", "Tracker", "Tracking", "open_tracking"]
+__all__ = ["NullTracker", "NullTracking", "RunInfo", "Tracker", "Tracking", "TrackingKind", "open_tracking"]
+
+TrackingKind = Literal["off", "jsonl", "mlflow"]
 
 
-def open_tracking(kind: str, root: Path, uri: str = "") -> Tracking:
+def open_tracking(kind: TrackingKind, root: Path, uri: str = "") -> Tracking:
     """The tracking of one process.
 
     Args:
@@ -25,14 +28,13 @@ def open_tracking(kind: str, root: Path, uri: str = "") -> Tracking:
     Raises:
         RtgsError: for another kind.
     """
+    refuse_unknown("tracking.kind", kind, TrackingKind)
     if kind == "off":
         return NullTracking()
     if kind == "jsonl":
         from rtgs.track.jsonl import JsonlTracking
 
         return JsonlTracking(root / "tracking")
-    if kind == "mlflow":
-        from rtgs.track.mlflow import MlflowTracking
+    from rtgs.track.mlflow import MlflowTracking
 
-        return MlflowTracking(root, uri)
-    raise RtgsError(f"tracking.kind={kind!r} is unknown; choose off, jsonl or mlflow")
+    return MlflowTracking(root, uri)

@@ -12,7 +12,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, fields, is_dataclass
+from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass
 from pathlib import Path
 
 from safetensors import SafetensorError
@@ -20,6 +20,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from rtgs.core.errors import RtgsError
+from rtgs.core.recipe import left_out_at
 from rtgs.train.settings import ScheduleSettings
 
 FORMAT = 1
@@ -240,12 +241,12 @@ def _differences(old: str, new: str, settings: RunSettings) -> list[str]:
 
 
 def _added_settings(value: object, prefix: str = "") -> Iterator[tuple[str, object]]:
-    """Keys that settings did not have once, with the default that says what was done then (``recipe: unless default``,
-    :data:`rtgs.workflow.fingerprint.UNLESS_DEFAULT`): a run that an older version began goes on."""
+    """Keys that settings did not have once, with the value that says what was done then (:mod:`rtgs.core.recipe`): a
+    run that an older version began goes on."""
     for item in fields(value) if is_dataclass(value) else ():
         key, inner = f"{prefix}{item.name}", getattr(value, item.name)
-        if item.metadata.get("recipe") == "unless default":
-            yield key, item.default
+        if (before := left_out_at(item)) is not MISSING:
+            yield key, before
         yield from _added_settings(inner, f"{key}.")
 
 

@@ -6,16 +6,22 @@ Steps count from 0. A stage boundary "from" is the first step at which something
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
-from rtgs.core.refuse import refuse_bad_numbers, refuse_unless
+from rtgs.core.refuse import refuse_bad_numbers, refuse_unknown_words, refuse_unless
+
+MonoNormalForm = Literal["cosine", "envgs"]
+PerceptualForm = Literal["lpips", "vgg_l1"]
+TransmissionDepthForm = Literal["accum", "mean", "per_hit"]
 
 
 @dataclass(frozen=True)
 class LossSettings:
     """Weights of the loss terms (method.md 5). A zero weight means the term is never computed.
 
-    ``*_start`` is the share of the run's total steps after which a term is on: the one kind of boundary that keeps its
-    sense when a run shrinks from 60,000 steps to 2,000, so methods own it and presets do not repeat it.
+    A term that only some methods have is 0 here, and they give its weight. ``*_start`` is the share of the run's total
+    steps after which a term is on, so that it keeps its sense when a run shrinks from 60,000 steps to 2,000. Presets
+    move only the two that begin with the third stage, whose start they move.
     """
 
     l1: float = 0.8
@@ -27,13 +33,13 @@ class LossSettings:
     mono_normal_gain: float = 1.0  # its weight is multiplied by it: short presets (docs/reflection.md), 1 = published
     mono_normal_masked: float = 1.0  # times that again in masks of transparent objects (docs/transmittance.md)
     mono_normal_start: float = 0.0  # EnvGS: from 0
-    mono_normal_form: str = "cosine"  # "cosine" (paper: 1 - n.N) or "envgs" (|difference|_1 + 1 - cos)
+    mono_normal_form: MonoNormalForm = "cosine"  # the paper: 1 - n.N; "envgs": |difference|_1 + 1 - cos
     distortion: float = 0.0  # 2DGS: 0 unbounded, 1000 bounded
     distortion_start: float = 0.1  # 2DGS: from 3,000 of 30,000
     # Perceptual loss of the second stage, where the VGG weights are there (decision 20).
     perceptual: float = 0.0  # RT-GS and EnvGS 0.01
     perceptual_start: float = 0.35  # 21,000 of 60,000
-    perceptual_form: str = "lpips"  # LPIPS-VGG on [0, 1] images, as EnvGS; "vgg_l1": L1 of raw VGG features
+    perceptual_form: PerceptualForm = "lpips"  # LPIPS-VGG on [0, 1] images, as EnvGS; "vgg_l1": L1 of raw VGG features
     perceptual_crop: int = 64  # side of the random crop it looks at: the whole image would dwarf the rest of a step
     # L_spec, mean of mask * ReLU(target - k_s): where the scene has masks of transparent objects (decision 10).
     specular: float = 0.0  # RT-GS 0.2, from its third stage on
@@ -42,14 +48,12 @@ class LossSettings:
     # L_d: the first straight ray's hits lie before the back surface (method.md 5.1; decision 11).
     transmission_depth: float = 0.0  # RT-GS 0.2
     transmission_depth_start: float = 2 / 3  # 40,000 of 60,000
-    transmission_depth_form: str = "accum"  # of sum w t; "mean": divided by sum w; "per_hit": each hit by itself
+    # "accum": of sum w t; "mean": divided by sum w; "per_hit": each hit by itself
+    transmission_depth_form: TransmissionDepthForm = "accum"
 
     def __post_init__(self) -> None:
         refuse_bad_numbers(self, "method.loss")
-        form = self.perceptual_form
-        refuse_unless(form in ("lpips", "vgg_l1"), "method.loss.perceptual_form", form, "lpips or vgg_l1")
-        form, forms = self.transmission_depth_form, ("accum", "mean", "per_hit")
-        refuse_unless(form in forms, "method.loss.transmission_depth_form", form, ", ".join(forms))
+        refuse_unknown_words(self, "method.loss")
         refuse_unless(self.perceptual_crop >= 32, "method.loss.perceptual_crop", self.perceptual_crop, "at least 32")
 
 

@@ -14,10 +14,11 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from rtgs.core.errors import RtgsError
-from rtgs.track import open_tracking
+from rtgs.core.refuse import refuse_unknown_words
+from rtgs.track import TrackingKind, open_tracking
 from rtgs.workflow.executors import InlineExecutor
 from rtgs.workflow.outcome import StepOutcome, SweepOutcomes
 from rtgs.workflow.plan import Plan
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
     from distributed import Client
 
 log = logging.getLogger("rtgs.workflow")
-ENGINES = ("local", "ssh", "slurm", "address")
+EngineKind = Literal["local", "ssh", "slurm", "address"]
 WORKER = "RTGS_WORKER"  # what rtgs.train.progress asks for
 
 
@@ -38,7 +39,7 @@ WORKER = "RTGS_WORKER"  # what rtgs.train.progress asks for
 class EngineSettings:
     """Where the workers come from. One worker runs one step at a time."""
 
-    kind: str = "local"
+    kind: EngineKind = "local"
     """``local`` processes, ``ssh`` hosts, ``slurm`` jobs, or the ``address`` of a scheduler that is running."""
     workers: int = 2
     threads: int = 0
@@ -61,8 +62,7 @@ class EngineSettings:
     """How many workers may die at one step before it counts as failed."""
 
     def __post_init__(self) -> None:
-        if self.kind not in ENGINES:
-            raise RtgsError(f"hydra.launcher.kind={self.kind!r} is unknown: choose one of {', '.join(ENGINES)}")
+        refuse_unknown_words(self, "hydra.launcher")
         if self.workers < 1 or self.threads < 0 or self.retries < 0:
             raise RtgsError(
                 f"hydra.launcher: workers={self.workers} must be at least 1, threads={self.threads} and "
@@ -88,7 +88,7 @@ class WorkerJob:
     store: str
     threads: int
     remote: str = ""
-    tracking: str = "off"
+    tracking: TrackingKind = "off"
     tracking_root: str = "."
     tracking_uri: str = ""
 

@@ -12,14 +12,16 @@ import math
 from collections.abc import Mapping
 from pathlib import Path
 
+from rtgs.core import recipe
+
 NOT_IN_RECIPE = {"recipe": False}
 """Metadata of a dataclass field that says where to read or how to show, never what is computed:
 ``source: str = field(metadata=NOT_IN_RECIPE)``. Such a field does not enter the fingerprint."""
 
 
-UNLESS_DEFAULT = {"recipe": "unless default"}
+UNLESS_DEFAULT = {"recipe": recipe.UNLESS_DEFAULT}
 """Metadata of a field with a plain default that was added to a recipe of old: while it has its default it stays out, so
-that what was made before keeps its key. (Rooms below the pipeline write the mapping itself.)"""
+that what was made before keeps its key. (Rooms below write the mapping itself; :mod:`rtgs.core.recipe`.)"""
 
 
 def canonical_json(value: object) -> str:
@@ -62,13 +64,13 @@ def _plain(value: object, where: str) -> object:
 
 
 def _in_recipe(field: dataclasses.Field, value: object) -> bool:
-    kept = field.metadata.get("recipe", True)
-    return value != field.default if kept == UNLESS_DEFAULT["recipe"] else bool(kept)
+    outside = recipe.left_out_at(field)
+    return bool(field.metadata.get("recipe", True)) if outside is dataclasses.MISSING else value != outside
 
 
-def fingerprint(recipe: object) -> str:
-    """64 hexadecimal digits: SHA-256 of the canonical JSON of ``recipe``."""
-    return hashlib.sha256(canonical_json(recipe).encode()).hexdigest()
+def fingerprint(value: object) -> str:
+    """64 hexadecimal digits: SHA-256 of the canonical JSON of a recipe."""
+    return hashlib.sha256(canonical_json(value).encode()).hexdigest()
 
 
 def file_digest(path: Path) -> str:

@@ -98,16 +98,11 @@ def test_the_command_line_wins_over_files_and_preset():
         ("preset=smoek", ["preset/smoek", "Did you mean smoke?"]),
         ("+foo=3", ["no key foo"]),
         ("seed=[1", ["'seed=[1' is not a legal override", "quotes"]),
-        ("scene.format=colmp", ["colmp", "did you mean 'colmap'"]),
+        ("scene.format=colmp", ["scene.format='colmp'", "did you mean 'colmap'"]),
     ],
 )
 def test_a_mistake_on_the_command_line_is_named(override, expected):
-    if override.startswith("scene.format"):
-        with pytest.raises(ValueError, match="colmp") as raised:
-            compose([override])
-        text = str(raised.value)
-    else:
-        text = message(override)
+    text = message(override)
     for part in expected:
         assert part in text
 
@@ -133,9 +128,9 @@ def test_a_mistake_in_a_file_names_file_and_key(conf_copy, group, content, expec
 @pytest.mark.parametrize(
     ("word", "expected"),
     [
-        ("mesh.source=hul", "mesh.source=hul must be auto or hull or tsdf or given"),
-        ("mesh.of=objct", "mesh.of=objct must be object or scene"),
-        ("mesh.object.flat=maybe", "mesh.object.flat=maybe must be auto or yes or no"),
+        ("mesh.source=hul", "mesh.source='hul' is unknown: choose one of auto, hull, tsdf, given; did you mean 'hull'"),
+        ("mesh.of=objct", "mesh.of='objct' is unknown: choose one of object, scene; did you mean 'object'"),
+        ("mesh.object.flat=maybe", "mesh.object.flat='maybe' is unknown: choose one of auto, yes, no"),
         ("mesh.object.hull.voxels=0", "mesh.object.hull.voxels=0 must be at least 8"),
         ("mesh.object.hull.min_seen=2.0", "mesh.object.hull.min_seen=2.0 must be between 0 and 1"),
         ("mesh.object.hull.trim_cost=-1", "mesh.object.hull.trim_cost=-1.0 must be a finite number of at least 0"),

@@ -101,8 +101,11 @@ def test_a_file_gives_back_the_same_bits(tmp_path, third_scale: bool, channels: 
     [
         ({"specular": 0.0}, "method.materials.specular=0.0 must be between 0 and 1"),
         ({"roughness": 1e-4}, "method.materials.roughness=0.0001 must be between 0.001 and 1"),
-        ({"f0_channels": 2}, "method.materials.f0_channels=2 must be 1 or 3"),
-        ({"roughness_curve": "cubic"}, "method.materials.roughness_curve=cubic must be log or linear"),
+        ({"f0_channels": 2}, "method.materials.f0_channels=2 is unknown: choose one of 1, 3"),
+        (
+            {"roughness_curve": "cubic"},
+            "method.materials.roughness_curve='cubic' is unknown: choose one of log, linear",
+        ),
     ],
 )
 def test_settings_that_mean_nothing_are_refused_by_their_key(change: dict, message: str):

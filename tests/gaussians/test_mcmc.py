@@ -162,7 +162,10 @@ def test_a_scene_in_other_units_is_perturbed_alike():
 def test_the_strategy_is_chosen_by_name():
     assert type(density_control(MCMC, 1.0)) is McmcControl
     assert type(density_control(DensitySettings(), 1.0)) is DensityControl
-    with pytest.raises(ValueError, match=r"method\.density\.strategy='mcms' must be one of adaptive, mcmc"):
+    with pytest.raises(
+        ValueError,
+        match=r"method\.density\.strategy='mcms' is unknown: choose one of adaptive, mcmc; did you mean 'mcmc'",
+    ):
         DensitySettings(strategy="mcms")
     with pytest.raises(ValueError, match=r"method\.density\.mcmc\.noise=-1\.0"):
         McmcSettings(noise=-1.0)

@@ -221,7 +221,7 @@ def test_given_meshes(tmp_path: Path) -> None:
 
 def test_misspelt_choices() -> None:
     masks = masks_of(sphere(0.8, 16), ring(6))
-    with pytest.raises(RtgsError, match="source is 'hul'"):
+    with pytest.raises(RtgsError, match=r"mesh\.source='hul' is unknown: .*did you mean 'hull'"):
         chosen("hul", masks)
-    with pytest.raises(ValueError, match=r"mesh\.object\.flat=maybe must be auto or yes or no"):
+    with pytest.raises(ValueError, match=r"mesh\.object\.flat='maybe' is unknown: choose one of auto, yes, no"):
         replace(SETTINGS, flat="maybe")

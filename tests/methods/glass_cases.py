@@ -24,6 +24,7 @@ from rtgs.train.trainer import Trainer
 
 CORE = 0.3  # radius of what is inside
 REFLECTED = 0.25  # share of light that the glass reflects
+INTERFACE = InterfaceSettings(count=150, normal_loss=0.2, normal_hold=0.0)  # the loss that depends on the picture
 
 
 @dataclass(frozen=True)
@@ -105,7 +106,8 @@ def glass_recipe(**changes) -> MethodSettings:
         sh_every=10,
         rim=0,  # of a 24x18 picture 2 pixels are much
         keep_seen=0,
-        interface=InterfaceSettings(count=150),
+        max_gain=None,
+        interface=INTERFACE,
         density=DensitySettings(gradient_threshold=1e-6, max_surfels=600, min_opacity=0.005),
         init=InitSettings(scale=0.5),
     )
@@ -160,4 +162,4 @@ def randomised(method: Model, seed: int = 4) -> Tensor | None:
 
 def held(weight: float, rate: float = 0.0) -> MethodSettings:
     """Normals held by ``weight``, and nothing else that holds them."""
-    return glass_recipe(interface=InterfaceSettings(count=150, normal_loss=rate, normal_hold=weight))
+    return glass_recipe(interface=replace(INTERFACE, normal_loss=rate, normal_hold=weight))

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from glass_cases import GlassScene, begun, glass_recipe, glass_scene, new_glass_method, train_stages
+from glass_cases import INTERFACE, GlassScene, begun, glass_recipe, glass_scene, new_glass_method, train_stages
 from mirror_scene import BALL, RADIUS, ball_hit
 from reflective_cases import schedule, use
 from torch import Tensor
@@ -18,13 +18,12 @@ from rtgs.methods import Mode, RenderOptions
 from rtgs.methods.model import Model
 from rtgs.methods.parts.glass_evidence import glass_faces, on_surface, seen_bare
 from rtgs.methods.parts.interface_set import normal_quaternions
-from rtgs.methods.settings import InterfaceSettings
 from rtgs.methods.shading.mirror import SurfacePixels
 from rtgs.methods.shading.straight import glass_pixels, widened
 from rtgs.scenes.scene import View
 
 LABEL = -0.1  # of the radius: above this height the ball is covered
-VOTED = InterfaceSettings(count=150, masked_share=0.5)
+VOTED = replace(INTERFACE, masked_share=0.5)
 
 
 def ball_points(camera: Camera) -> tuple[Tensor, Tensor]:

@@ -6,12 +6,11 @@ from dataclasses import replace
 
 import pytest
 import torch
-from glass_cases import GlassScene, begun, glass_recipe, glass_scene, held, new_glass_method, train_stages
+from glass_cases import INTERFACE, GlassScene, begun, glass_recipe, glass_scene, held, new_glass_method, train_stages
 from mirror_scene import BALL
 
 from rtgs.gaussians.density import select_rows
 from rtgs.methods.parts.interface_set import interface_surfels, normal_quaternions
-from rtgs.methods.settings import InterfaceSettings
 from rtgs.train.method import Mode
 
 
@@ -62,7 +61,7 @@ def test_the_interface_is_held_to_the_normals_it_was_put_with(made: GlassScene):
 
 def test_the_floor_of_the_interface_is_the_settings_own(made: GlassScene):
     """Also of a set that goes on from a checkpoint."""
-    recipe = glass_recipe(interface=InterfaceSettings(count=150, floor=0.6))
+    recipe = glass_recipe(interface=replace(INTERFACE, floor=0.6))
     method = begun(recipe, made)
     resumed = new_glass_method(recipe, made)
     resumed.load({name: tensor.clone() for name, tensor in method.state().items()})

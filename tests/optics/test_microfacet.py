@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import replace
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -21,13 +22,15 @@ from rtgs.optics.microfacet import (
     smith_masking,
     specular_weights,
 )
-from rtgs.optics.settings import MASKINGS, WEIGHTS, OpticsSettings
+from rtgs.optics.settings import Masking, OpticsSettings, Remap, Weight
 from rtgs.optics.split_sum import SMALLEST_COSINE, WIDEST, lobe_factors, split_sum_factors, split_sum_table
 
 DEFAULT = OpticsSettings()
 EVERY_SETTING = [
     OpticsSettings(weight=weight, max_gain=bound, remap=remap, masking=masking)
-    for weight, bound, remap, masking in itertools.product(WEIGHTS, (0.0, 1.0, 16.0), ("pbrt", "none"), MASKINGS)
+    for weight, bound, remap, masking in itertools.product(
+        get_args(Weight), (0.0, 1.0, 16.0), get_args(Remap), get_args(Masking)
+    )
 ]
 
 
@@ -67,7 +70,7 @@ def test_below_its_floor_the_remap_stands_still_instead_of_turning_round():
     assert bool((above.diff() > 0).all())
 
 
-@pytest.mark.parametrize("masking", MASKINGS)
+@pytest.mark.parametrize("masking", get_args(Masking))
 def test_the_closed_form_is_the_generic_brdf_at_the_mirror_direction(masking: str):
     cosine, width = torch.meshgrid(
         torch.linspace(1e-3, 1, 60, dtype=torch.float64),
@@ -211,7 +214,7 @@ def test_the_cosine_can_be_cut_off():
 
 def test_rgb_f0_is_the_scalar_form_channel_by_channel():
     cosine, roughness, f0 = f64(0.2, 0.9), f64(0.1, 0.5), torch.rand(2, 3, dtype=torch.float64)
-    for weight in WEIGHTS:
+    for weight in get_args(Weight):
         optics = OpticsSettings(weight=weight)
         rgb = specular_weights(cosine, roughness, f0, optics)
         for channel in range(3):
@@ -245,8 +248,11 @@ def test_nothing_is_ever_nan_and_gradients_are_bounded(cosine: float, alpha: flo
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"weight": "ggx"}, "method.optics.weight is 'ggx': choose one of microfacet, literal, split_sum, envgs"),
-        ({"masking": "none"}, "method.optics.masking is 'none'"),
+        (
+            {"weight": "ggx"},
+            "method.optics.weight='ggx' is unknown: choose one of microfacet, literal, split_sum, envgs",
+        ),
+        ({"masking": "none"}, "method.optics.masking='none' is unknown: choose one of correlated, separable"),
         ({"max_gain": math.inf}, "method.optics.max_gain=inf"),
         ({"cosine_floor": 0.0}, "method.optics.cosine_floor=0.0 must be above 0"),
     ],

@@ -10,8 +10,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
+from rtgs.core.build import build
 from rtgs.optics.settings import OpticsSettings
-from rtgs.workflow.fingerprint import NOT_IN_RECIPE, UNLESS_DEFAULT, canonical_json, fingerprint, flatten
+from rtgs.workflow.fingerprint import (
+    NOT_IN_RECIPE,
+    UNLESS_DEFAULT,
+    canonical_json,
+    fingerprint,
+    flatten,
+    recipe_params,
+)
 
 
 @dataclass(frozen=True)
@@ -48,6 +56,20 @@ def test_a_choice_that_came_later_enters_where_it_is_made():
     assert canonical_json(Later(light="linear")) == '{"light":"linear","steps":3}'
     assert "blend" not in canonical_json(OpticsSettings())
     assert '"blend":"linear"' in canonical_json(OpticsSettings(blend="linear"))
+
+
+def test_a_default_may_change_without_a_recipe_of_old():
+    """A recipe without the key means what was done before there was one, when it is read as well."""
+
+    @dataclass(frozen=True)
+    class Later:
+        steps: int = 3
+        hold: float = field(default=20.0, metadata={"recipe": "unless", "value": 0.0})
+
+    assert canonical_json(Later()) == '{"hold":20.0,"steps":3}'
+    assert canonical_json(Later(hold=0.0)) == '{"steps":3}'
+    for made in (Later(), Later(hold=0.0), Later(steps=4, hold=5.0)):
+        assert build(Later, recipe_params(made)) == made
 
 
 @pytest.mark.parametrize("spelling", ["0.001", "1.0e-3", "1.e-03", "0.00100"])

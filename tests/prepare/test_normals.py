@@ -16,6 +16,7 @@ onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
 
 from pipelines.cli.main import main  # noqa: E402
+from rtgs.core.errors import RtgsError  # noqa: E402
 from rtgs.prepare.errors import PrepareError  # noqa: E402
 from rtgs.prepare.masks.makers import file_digest  # noqa: E402
 from rtgs.prepare.normals.adapters import ADAPTERS, NormalAdapter  # noqa: E402
@@ -322,7 +323,7 @@ def test_a_wrong_model_is_a_message(tmp_path, capture):
     ],
 )
 def test_settings_out_of_range_are_refused(make_settings, message):
-    with pytest.raises(PrepareError, match=message):
+    with pytest.raises(RtgsError, match=message):
         make_settings()
 
 

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from rtgs.core.errors import RtgsError
 from rtgs.prepare.errors import PrepareError
 from rtgs.prepare.poses import pairs
 from rtgs.prepare.poses.compare import compare_poses
@@ -151,7 +152,7 @@ def test_the_gap_around_a_scene():
     ],
 )
 def test_settings_out_of_range_are_refused(make, message):
-    with pytest.raises(PrepareError, match=message):
+    with pytest.raises(RtgsError, match=message):
         make()
 
 

@@ -188,7 +188,7 @@ def test_duplicate_names(tmp_path):
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
-        ({"format": "colamp"}, r"scene setting format='colamp' is unknown: .*did you mean 'colmap'\?"),
+        ({"format": "colamp"}, r"scene\.format='colamp' is unknown: .*did you mean 'colmap'\?"),
         ({"points": "sfm"}, "points='sfm' is unknown: choose one of auto, random"),
         ({"normals_frame": "opengL"}, r"did you mean 'opengl'\?"),
         ({"long_side": 0}, "long_side=0: must be at least 1"),
@@ -199,7 +199,7 @@ def test_duplicate_names(tmp_path):
     ],
 )
 def test_settings_out_of_range(keys, message):
-    with pytest.raises(CaptureError, match=message):
+    with pytest.raises(ValueError, match=message):
         SceneSettings(**keys)
 
 

@@ -12,6 +12,8 @@ import pytest
 from omegaconf import OmegaConf
 from omegaconf.errors import ConfigKeyError, ValidationError
 
+from rtgs.config.schema import open_schema
+from rtgs.core.build import build
 from rtgs.scenes.scene import load_scene
 from rtgs.scenes.settings import SceneSettings
 
@@ -19,13 +21,15 @@ from .captures import ColmapCapture
 
 
 def test_it_is_a_schema_for_structured_configs():
-    config = OmegaConf.merge(SceneSettings, {"name": "ring", "long_side": 400, "background": [1, 1, 1]})
-    settings = OmegaConf.to_object(config)
-    assert settings == SceneSettings(name="ring", long_side=400, background=(1.0, 1.0, 1.0))
+    schema = open_schema(SceneSettings)
+    config = OmegaConf.merge(schema, {"name": "ring", "long_side": 400, "background": [1, 1, 1]})
+    values = OmegaConf.to_container(config)
+    assert isinstance(values, dict)
+    assert build(SceneSettings, values) == SceneSettings(name="ring", long_side=400, background=(1.0, 1.0, 1.0))
     with pytest.raises(ConfigKeyError):
-        OmegaConf.merge(SceneSettings, {"long_sid": 400})
+        OmegaConf.merge(schema, {"long_sid": 400})
     with pytest.raises(ValidationError):
-        OmegaConf.merge(SceneSettings, {"long_side": "big"})
+        OmegaConf.merge(schema, {"long_side": "big"})
 
 
 def test_every_field_is_documented():

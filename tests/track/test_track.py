@@ -83,7 +83,7 @@ def test_jsonl_tells_how_a_run_ended(tmp_path, error, status):
 
 
 def test_an_unknown_kind_lists_the_choices(tmp_path):
-    with pytest.raises(RtgsError, match=r"tracking\.kind='wandb' is unknown; choose off, jsonl or mlflow"):
+    with pytest.raises(RtgsError, match=r"tracking\.kind='wandb' is unknown: choose one of off, jsonl, mlflow"):
         open_tracking("wandb", tmp_path)
 
 

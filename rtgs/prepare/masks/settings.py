@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
-from rtgs.prepare.errors import PrepareError, check_choice
+from rtgs.core.refuse import refuse_unknown_words
+from rtgs.prepare.errors import PrepareError
 
-SOURCES = ("auto", "none", "given", "grounded_sam2", "grabcut", "polygon")
-PHRASES = ("separate", "together")
-LAYOUTS = ("files", "alpha")
-ACTIONS = ("auto", "flag", "repair", "drop")
+MaskSource = Literal["auto", "none", "given", "grounded_sam2", "grabcut", "polygon"]
+MaskLayout = Literal["files", "alpha"]
+CleanAction = Literal["auto", "flag", "repair", "drop"]
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class DetectorSettings:
     """Boxes that cover more of the photo are left out: that is the room, not an object."""
     max_boxes: int = 20
     """In one photo, best first."""
-    phrases: str = "separate"
+    phrases: Literal["separate", "together"] = "separate"
     """``separate``: one pass for each phrase. ``together``: one pass for all, quicker, and wrong with the export that
     most people use, which was traced with one phrase and sees only the first."""
     short_side: int = 800
@@ -41,7 +42,7 @@ class DetectorSettings:
     """Its ``tokenizer.json``. Empty: the registered name, or that beside ``file``."""
 
     def __post_init__(self) -> None:
-        check_choice("masks.detector.phrases", self.phrases, PHRASES)
+        refuse_unknown_words(self, "masks.detector")
         for key in ("box_threshold", "text_threshold", "nms_iou", "max_area"):
             _check_share(f"masks.detector.{key}", getattr(self, key))
         _check_least("masks.detector.max_boxes", self.max_boxes, 1)
@@ -78,7 +79,7 @@ class GivenSettings:
 
     folder: str = ""
     """Folder of the masks, relative to the capture. Empty: ``scene.masks_dir``."""
-    layout: str = "files"
+    layout: MaskLayout = "files"
     """``files``: one mask file for each photo. ``alpha``: the alpha channel of the photos themselves."""
     labels: tuple[int, ...] = ()
     """Label images: the values (grey level, or palette index) that mean glass. Empty: not label images."""
@@ -93,7 +94,7 @@ class GivenSettings:
     def __post_init__(self) -> None:
         object.__setattr__(self, "labels", tuple(self.labels))
         object.__setattr__(self, "label_colors", tuple(self.label_colors))
-        check_choice("masks.given.layout", self.layout, LAYOUTS)
+        refuse_unknown_words(self, "masks.given")
         if not (self.threshold == -1 or 0 <= self.threshold < 1):
             raise PrepareError(f"setting masks.given.threshold={self.threshold}: give a share in [0, 1), or -1")
         for color in self.label_colors:
@@ -136,7 +137,7 @@ class DrawnSettings:
 class CleanSettings:
     """Masks against each other: the visual hull of all of them, seen from every photo."""
 
-    action: str = "auto"
+    action: CleanAction = "auto"
     """``flag``: tell only. ``repair``: inside what the hull rules in, outside what it rules out. ``drop``: the photo
     goes without a mask. ``auto``: repair masks made here, flag given ones."""
     voxels: int = 64
@@ -153,7 +154,7 @@ class CleanSettings:
     """IoU of a mask with the hull's silhouette, edges forgiven, below which it is flagged."""
 
     def __post_init__(self) -> None:
-        check_choice("masks.clean.action", self.action, ACTIONS)
+        refuse_unknown_words(self, "masks.clean")
         _check_least("masks.clean.voxels", self.voxels, 16)
         _check_least("masks.clean.mask_size", self.mask_size, 64)
         _check_least("masks.clean.min_views", self.min_views, 3)
@@ -170,7 +171,7 @@ class MaskSettings:
         PrepareError: a value outside its documented range.
     """
 
-    source: str = "auto"
+    source: MaskSource = "auto"
     """``none``; ``given``: read and checked as ``given`` says; ``grounded_sam2``: from words, by networks;
     ``grabcut``, ``polygon``: from marks in a few photos. ``auto``: nothing where the capture brings masks or has no
     glass; the marks where their file is there; the networks where the method reads masks and their files are there."""
@@ -181,7 +182,7 @@ class MaskSettings:
     clean: CleanSettings = field(default_factory=CleanSettings)
 
     def __post_init__(self) -> None:
-        check_choice("masks.source", self.source, SOURCES)
+        refuse_unknown_words(self, "masks")
 
 
 def parse_color(text: str) -> tuple[int, int, int]:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
-from rtgs.prepare.errors import PrepareError, check_choice
+from rtgs.core.refuse import refuse_unknown_words
+from rtgs.prepare.errors import PrepareError
 
+NormalNetwork = Literal["stablenormal", "dsine", "omnidata", "metric3d"]
 _AXES = ("+x", "-x", "+y", "-y", "+z", "-z")
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
@@ -35,7 +38,7 @@ class NormalAdapter:
     """The network sees (picture - mean) / std, the picture in 0..1: a std of 1/255 gives it 0..255."""
     channels_last: bool = False
     """(1, H, W, 3) instead of (1, 3, H, W), input and output."""
-    fit: str = "multiple"
+    fit: Literal["multiple", "stretch", "pad"] = "multiple"
     """``multiple``: shrink to ``size`` on the long side and round both sides to a multiple of ``multiple``;
     ``stretch``: to size x size, aspect lost; ``pad``: shrink into (height, width) = ``box`` and pad with ``fill``."""
     size: int = 768
@@ -46,7 +49,7 @@ class NormalAdapter:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "axes", tuple(self.axes))
-        check_choice("normals.adapter.fit", self.fit, ("multiple", "stretch", "pad"))
+        refuse_unknown_words(self, "normals.adapter")
         if len(self.axes) != 3 or {axis[-1:] for axis in self.axes} != set("xyz") or set(self.axes) - set(_AXES):
             raise PrepareError(
                 f"setting normals.adapter.axes={list(self.axes)}: give three of {', '.join(_AXES)}, one for each axis"
@@ -61,7 +64,7 @@ class NormalAdapter:
         return result
 
 
-ADAPTERS: dict[str, NormalAdapter] = {
+ADAPTERS: dict[NormalNetwork, NormalAdapter] = {
     # Axes as the authors say: x left, y up, z at the camera (Stable-X/StableNormal issue 18). Range and sizes assumed.
     "stablenormal": NormalAdapter(axes=("-x", "-y", "-z"), mean=(0.5,) * 3, std=(0.5,) * 3, multiple=64),
     # Axes as the author says: x right, y down, z forward, but outward, a wall that faces the camera is (0, 0, 1): all

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 from rtgs.core.errors import RtgsError
+from rtgs.core.refuse import refuse_unknown_words
 
-TRUTHS = ("all", "test", "none")
 _LARGEST_SIDE = 8192
 
 
@@ -42,8 +43,8 @@ class CaptureSettings:
     """Paths a pixel of test views, rendered as two halves that measure their noise."""
     test_every: int = 8
     """Views whose index is divisible by it are test views, as the importer splits them (method.md 8.1)."""
-    truth: str = "all"
-    """Which views get a truth/ folder: ``all``, ``test`` or ``none``."""
+    truth: Literal["all", "test", "none"] = "all"
+    """Which views get a truth/ folder."""
     jpeg_quality: int = 95
     """Of training images, without chroma subsampling; test images are PNG."""
     normal_tilt: float = 6.0
@@ -60,8 +61,7 @@ class CaptureSettings:
             value = getattr(self, name)
             if not least <= value <= (_LARGEST_SIDE if name in ("width", "height") else 1 << 20):
                 raise RtgsError(f"synthesize: {name}={value} is out of range, give {least} or more")
-        if self.truth not in TRUTHS:
-            raise RtgsError(f"synthesize: truth={self.truth!r} is unknown: choose one of {', '.join(TRUTHS)}")
+        refuse_unknown_words(self, "synthesize")
         if not 1 <= self.jpeg_quality <= 100:
             raise RtgsError(f"synthesize: jpeg_quality={self.jpeg_quality} must lie in 1..100")
         if not 0 < self.normal_scale <= 1:
