@@ -11,28 +11,4 @@ def train_diffuse(params: StageParams, context: StepContext) -> None:
     train_stage(params, context)
 
 
-STEP = StepKind(
-    "train_diffuse",
-    5,
-    train_diffuse,
-    helpers=(
-        "pipelines.steps.training",
-        "rtgs.methods.surfel_base",
-        "rtgs.methods.gs3d",
-        "rtgs.methods.surfel_set",
-        "rtgs.train.trainer",
-        "rtgs.train.schedule",
-        "rtgs.train.view_order",
-        "rtgs.train.losses",
-        "rtgs.gaussians.adam",
-        "rtgs.gaussians.initialize",
-        "rtgs.gaussians.density",
-        "rtgs.gaussians.mcmc",
-        "rtgs.gaussians.primitives",
-        "rtgs.gaussians.activate",
-        "rtgs.gaussians.ply",
-        "rtgs.render.surfels",
-        "rtgs.render.ellipsoids",
-        "rtgs.native",
-    ),
-)
+STEP = StepKind("train_diffuse", 5, train_diffuse)

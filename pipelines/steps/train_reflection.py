@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pipelines.steps import train_diffuse
 from pipelines.steps.training import StageParams, train_stage
 from rtgs.workflow import StepContext, StepKind
 
@@ -12,22 +11,4 @@ def train_reflection(params: StageParams, context: StepContext) -> None:
     train_stage(params, context)
 
 
-STEP = StepKind(
-    "train_reflection",
-    3,
-    train_reflection,
-    helpers=(
-        *train_diffuse.STEP.helpers,
-        "rtgs.methods.reflective",
-        "rtgs.methods.reflection_set",
-        "rtgs.methods.traced_set",
-        "rtgs.methods.mirror",
-        "rtgs.methods.traced_pixels",
-        "rtgs.methods.propagation",
-        "rtgs.methods.matte",
-        "rtgs.gaussians.materials",
-        "rtgs.optics.microfacet",
-        "rtgs.optics.split_sum",
-        "rtgs.render.trace",
-    ),
-)
+STEP = StepKind("train_reflection", 3, train_reflection)

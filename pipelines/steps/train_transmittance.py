@@ -6,7 +6,6 @@ import json
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from pipelines.steps import train_reflection
 from pipelines.steps.extract_mesh import why_absent
 from pipelines.steps.training import StageParams, load_method, train_stage
 from rtgs.workflow import StepContext, StepKind
@@ -63,21 +62,4 @@ def _numbers(scores: BoundaryScores, when: str) -> dict[str, float]:
     return {f"boundary/{when}/{name}": value for name, value in vars(scores).items() if isinstance(value, float)}
 
 
-STEP = StepKind(
-    "train_transmittance",
-    5,
-    train_transmittance,
-    helpers=(
-        *train_reflection.STEP.helpers,
-        "rtgs.methods.transmittance",
-        "rtgs.methods.transmittance_set",
-        "rtgs.methods.interface_set",
-        "rtgs.methods.glass",
-        "rtgs.methods.glass_evidence",
-        "rtgs.methods.glass_stage",
-        "rtgs.evaluate.boundary",
-        "rtgs.mesh.container",
-        "rtgs.mesh.guide",
-        "rtgs.mesh.normals",
-    ),
-)
+STEP = StepKind("train_transmittance", 5, train_transmittance)

@@ -20,6 +20,7 @@ from rtgs.train.settings import MethodSettings, ScheduleSettings
 SCHEMA_NAME = "run_schema"
 _DOT = "__"  # in the names of twins
 MESH_OF = ("object", "scene")
+REACHES = ()  # by name: only settings that a launcher unpickles; a step gets them as parameters
 
 
 @dataclass(frozen=True)

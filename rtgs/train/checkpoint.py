@@ -237,7 +237,7 @@ def _differences(old: str, new: str) -> list[str]:
 
 def _added_settings(value: object, prefix: str = "") -> Iterator[tuple[str, object]]:
     """Keys that settings did not have once, with the default that says what was done then (``recipe: unless default``,
-    :data:`rtgs.workflow.fingerprint.UNLESS_DEFAULT`): a run that an older version began goes on."""
+    :data:`rtgs.core.recipe.UNLESS_DEFAULT`): a run that an older version began goes on."""
     for item in fields(value) if is_dataclass(value) else ():
         key, inner = f"{prefix}{item.name}", getattr(value, item.name)
         if item.metadata.get("recipe") == "unless default":

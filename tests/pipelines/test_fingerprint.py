@@ -10,8 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
+from rtgs.core.recipe import NOT_IN_RECIPE, UNLESS_DEFAULT, canonical_json
 from rtgs.optics.settings import OpticsSettings
-from rtgs.workflow.fingerprint import NOT_IN_RECIPE, UNLESS_DEFAULT, canonical_json, fingerprint, flatten
+from rtgs.workflow.fingerprint import fingerprint, flatten
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,9 @@ import math
 import pytest
 
 from rtgs.config import compose
+from rtgs.core.recipe import canonical_json
 from rtgs.train.settings import LossSettings, OptimizerSettings
 from rtgs.train.specular_settings import InterfaceSettings
-from rtgs.workflow.fingerprint import canonical_json
 
 
 @pytest.mark.parametrize("value", [-0.1, math.nan, math.inf])
