@@ -157,7 +157,7 @@ class SourceTree:
 def _read_module(file: str, text: str) -> _Module:
     tree = ast.parse(text, file)
     package = file.removesuffix(".py").split("/")[:-1]
-    reader = _ImportReader(package, file)
+    reader = _ImportReader(package)
     reader.visit(tree)
     return _Module(_digest(_meaning(tree)), tuple(reader.imports), reader.hidden, _declaration(tree, file))
 
@@ -165,11 +165,10 @@ def _read_module(file: str, text: str) -> _Module:
 class _ImportReader(ast.NodeVisitor):
     """Collects the imports of a module that can run, and the first thing that only a declaration explains."""
 
-    def __init__(self, package: list[str], file: str) -> None:
+    def __init__(self, package: list[str]) -> None:
         self.imports: list[tuple[str, tuple[str, ...]]] = []
         self.hidden = ""
         self._package = package
-        self._file = file
 
     def visit_Import(self, node: ast.Import) -> None:
         self.imports += [(alias.name, ()) for alias in node.names]
