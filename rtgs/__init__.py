@@ -1,3 +1,5 @@
 """rtgs: Gaussian models of scenes with glass and mirrors, on the CPU."""
 
-__version__ = "0.1.0"
+from rtgs.core.version import VERSION as __version__
+
+__all__ = ["__version__"]

@@ -11,10 +11,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
 
-from rtgs import __version__
 from rtgs.core.errors import RtgsError
+from rtgs.core.version import VERSION
 
-USAGE = f"""rtgs {__version__}: Gaussian models of scenes with glass and mirrors, on the CPU
+USAGE = f"""rtgs {VERSION}: Gaussian models of scenes with glass and mirrors, on the CPU
 
   rtgs run [group=choice] [key=value]     train, render, measure, report; what is cached is not run again
   rtgs run synthesize scene=NAME|all      path-trace a described scene into a capture with known truth
@@ -36,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(USAGE)
         return 0 if words else 2
     if words[0] == "--version":
-        print(__version__)
+        print(VERSION)
         return 0
     command = COMMANDS.get(words[0])
     if command is None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from pipelines.planning.graph import RunGraph, build_graph
 from pipelines.planning.preparation import SkippedStep
-from pipelines.publishing.results import plan_rows
+from pipelines.planning.rows import plan_rows
 from rtgs.config.schema import Choices, RunConfig
 from rtgs.config.sweep import ComposedJob, compose_jobs
 from rtgs.config.words import friendly_overrides

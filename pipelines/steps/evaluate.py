@@ -106,19 +106,4 @@ def object_facts(folder: Path, scene: Scene) -> ObjectFacts | None:
     )
 
 
-STEP = StepKind(
-    "evaluate",
-    5,
-    evaluate,
-    helpers=(
-        "rtgs.evaluate.evaluate",
-        "rtgs.evaluate.records",
-        "rtgs.evaluate.layers",
-        "rtgs.evaluate.surface",
-        "rtgs.mesh.container",
-        "rtgs.mesh.normals",
-        "rtgs.evaluate.metrics",
-        "rtgs.pretrained.lpips",
-        "rtgs.evaluate.images",
-    ),
-)
+STEP = StepKind("evaluate", 5, evaluate)

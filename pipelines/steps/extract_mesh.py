@@ -279,27 +279,4 @@ def _sizes(mesh: TriangleMesh) -> dict[str, float]:
     return {"mesh/vertices": float(len(mesh.vertices)), "mesh/triangles": float(len(mesh.faces))}
 
 
-STEP = StepKind(
-    "extract_mesh",
-    5,
-    extract_mesh,
-    helpers=(
-        "pipelines.steps.training",
-        "rtgs.mesh.choose",
-        "rtgs.mesh.container",
-        "rtgs.mesh.grid",
-        "rtgs.mesh.guide",
-        "rtgs.mesh.hull",
-        "rtgs.mesh.normals",
-        "rtgs.mesh.outlines",
-        "rtgs.mesh.pane",
-        "rtgs.mesh.settings",
-        "rtgs.mesh.silhouettes",
-        "rtgs.mesh.smoothing",
-        "rtgs.mesh.tsdf",
-        "rtgs.mesh.triangles",
-        "rtgs.methods.surfel_base",
-        "rtgs.methods.gs3d",
-        "rtgs.native",
-    ),
-)
+STEP = StepKind("extract_mesh", 5, extract_mesh)

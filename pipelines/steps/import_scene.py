@@ -73,22 +73,4 @@ def import_scene(params: ImportParams, context: StepContext) -> None:
     save_scene(load_scene(settings), context.out)
 
 
-STEP = StepKind(
-    "import_scene",
-    4,
-    import_scene,
-    helpers=(
-        "rtgs.scenes.canonical",
-        "rtgs.scenes.scene",
-        "rtgs.scenes.images",
-        "rtgs.scenes.truth",
-        "rtgs.scenes.truth_files",
-        "rtgs.scenes.synthetic.record",
-        "rtgs.scenes.points",
-        "rtgs.scenes.splits",
-        "rtgs.scenes.undistort",
-        "rtgs.scenes.importers.colmap",
-        "rtgs.scenes.importers.transforms",
-        "rtgs.scenes.importers.blender",
-    ),
-)
+STEP = StepKind("import_scene", 4, import_scene)

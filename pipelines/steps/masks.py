@@ -62,23 +62,4 @@ def masks(params: MaskParams, context: StepContext) -> None:
     context.tracker.metrics({"masks/made": float(report.masks), "masks/flagged": float(len(report.flagged))})
 
 
-STEP = StepKind(
-    "masks",
-    2,
-    masks,
-    helpers=(
-        "rtgs.prepare.masks.make",
-        "rtgs.prepare.masks.detect",
-        "rtgs.prepare.masks.drawn",
-        "rtgs.prepare.masks.given",
-        "rtgs.prepare.masks.grabcut",
-        "rtgs.prepare.masks.hull",
-        "rtgs.prepare.masks.makers",
-        "rtgs.prepare.masks.plane",
-        "rtgs.prepare.masks.report",
-        "rtgs.prepare.masks.segment",
-        "rtgs.prepare.onnx",
-        "rtgs.scenes.undistort",
-        "rtgs.scenes.images",
-    ),
-)
+STEP = StepKind("masks", 2, masks)

@@ -52,17 +52,4 @@ def normals(params: NormalParams, context: StepContext) -> None:
     make_normals(scene, settings, Path(params.cache), context.out, torch.get_num_threads(), context.log.info)
 
 
-STEP = StepKind(
-    "normals",
-    2,
-    normals,
-    helpers=(
-        "rtgs.prepare.normals.make",
-        "rtgs.prepare.normals.maps",
-        "rtgs.prepare.normals.tiles",
-        "rtgs.prepare.normals.adapters",
-        "rtgs.prepare.onnx",
-        "rtgs.scenes.undistort",
-        "rtgs.scenes.images",
-    ),
-)
+STEP = StepKind("normals", 2, normals)

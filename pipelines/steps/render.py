@@ -85,31 +85,4 @@ def read_timed(folder: Path, view_name: str, camera: Camera | None = None) -> Ti
     return TimedRender(tensors["image"], seconds[view_name], *layers, tensors.get(GIVEN), *surface)
 
 
-STEP = StepKind(
-    "render",
-    3,
-    render,
-    helpers=(
-        "pipelines.steps.training",
-        "rtgs.methods.reflective",
-        "rtgs.methods.reflection_set",
-        "rtgs.methods.traced_set",
-        "rtgs.methods.transmittance",
-        "rtgs.methods.glass",
-        "rtgs.methods.glass_evidence",
-        "rtgs.methods.glass_stage",
-        "rtgs.mesh.container",
-        "rtgs.mesh.normals",
-        "rtgs.methods.mirror",
-        "rtgs.methods.traced_pixels",
-        "rtgs.gaussians.materials",
-        "rtgs.optics.microfacet",
-        "rtgs.optics.split_sum",
-        "rtgs.render.trace",
-        "rtgs.methods.surfel_base",
-        "rtgs.methods.gs3d",
-        "rtgs.render.surfels",
-        "rtgs.render.ellipsoids",
-        "rtgs.native",
-    ),
-)
+STEP = StepKind("render", 3, render)

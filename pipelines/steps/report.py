@@ -206,4 +206,4 @@ def _steps(context: StepContext) -> tuple[StepLine, ...]:
     return tuple(lines)
 
 
-STEP = StepKind("report", 6, report, helpers=("rtgs.report.page", "rtgs.report.figures", "rtgs.report.layers"))
+STEP = StepKind("report", 6, report)

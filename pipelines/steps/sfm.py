@@ -76,19 +76,4 @@ def sfm(params: SfmParams, context: StepContext) -> None:
     )
 
 
-STEP = StepKind(
-    "sfm",
-    4,
-    sfm,
-    helpers=(
-        "rtgs.prepare.poses.find",
-        "rtgs.prepare.poses.photos",
-        "rtgs.prepare.poses.video",
-        "rtgs.prepare.poses.pairs",
-        "rtgs.prepare.poses.sfm",
-        "rtgs.prepare.poses.world",
-        "rtgs.prepare.poses.quality",
-        "rtgs.prepare.poses.export",
-        "rtgs.scenes.undistort",
-    ),
-)
+STEP = StepKind("sfm", 4, sfm)

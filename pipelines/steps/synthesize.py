@@ -71,21 +71,7 @@ def synthesize(params: SynthesizeParams, context: StepContext) -> None:
     )  # fmt: skip
 
 
-_MODULES = (
-    "assemble", "capture", "colmap_text", "description", "features", "geometry", "layers", "lightmap", "monocular",
-    "noise", "record", "render", "sculpt", "textures", "viewpoints",
-)  # fmt: skip
-
-STEP = StepKind(
-    "synthesize",
-    2,
-    synthesize,
-    helpers=(
-        "rtgs.scenes.truth",
-        "rtgs.scenes.truth_files",
-        *(f"rtgs.scenes.synthetic.{module}" for module in _MODULES),
-    ),
-)
+STEP = StepKind("synthesize", 2, synthesize)
 
 
 def synthesize_step(description: SceneDescription, file: Path, settings: CaptureSettings, variant: str | None) -> Step:

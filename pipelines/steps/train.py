@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 from collections.abc import Iterable
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipelines.steps.extract_mesh import why_absent
 from pipelines.steps.training import StageParams, last_training, load_method, train_stage
-from rtgs.methods import MethodSpec, StageSpec, find_method, own_methods
+from rtgs.methods import MethodSpec, StageSpec, find_method, is_own, own_methods
 from rtgs.workflow import Step, StepContext, StepKind
+from rtgs.workflow.fingerprint import file_digest
 
 if TYPE_CHECKING:
     from rtgs.evaluate.boundary import BoundaryScores
@@ -77,8 +80,15 @@ def kind_of(stage: StageSpec) -> StepKind:
 
 
 def train_step(spec: MethodSpec, params: StageParams, *upstream: Step) -> Step:
-    """The step of one stage of a method."""
-    return kind_of(spec.stage(params.stage)).step(params, *upstream)
+    """The step of one stage of a method. The source of a method from outside belongs to the recipe: no review of this
+    project asks for a new version when it changes."""
+    tools = () if is_own(spec) else ((f"method {spec.name}", _source_digest(spec)),)
+    return kind_of(spec.stage(params.stage)).step(params, *upstream, tools=tools)
+
+
+def _source_digest(spec: MethodSpec) -> str:
+    """SHA-256 of the file that composes the method."""
+    return file_digest(Path(inspect.getfile(spec.build)))
 
 
 def training_kinds(specs: Iterable[MethodSpec] | None = None) -> tuple[StepKind, ...]:

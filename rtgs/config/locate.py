@@ -5,8 +5,9 @@ from __future__ import annotations
 from functools import cache
 from pathlib import Path
 
-import rtgs
 from rtgs.core.errors import RtgsError
+
+REACHES = ()  # of conf/ a step sees its own parameters only
 
 
 @cache
@@ -16,7 +17,7 @@ def project_root() -> Path:
     Raises:
         RtgsError: the installation lacks them.
     """
-    root = Path(rtgs.__file__).resolve().parents[1]
+    root = Path(__file__).resolve().parents[2]
     if not (root / "conf" / "config.yaml").is_file():
         raise RtgsError(f"{root / 'conf' / 'config.yaml'} is missing: install rtgs again")
     return root

@@ -22,6 +22,7 @@ from rtgs.train.settings import ScheduleSettings
 
 SCHEMA_NAME = "run_schema"
 _DOT = "__"  # in the names of twins
+REACHES = ()  # by name: only settings that a launcher unpickles; a step gets them as parameters
 
 
 @dataclass(frozen=True)

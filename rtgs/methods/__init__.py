@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rtgs.methods.registry import find_method, method_names, own_methods
+from rtgs.methods.registry import find_method, is_own, method_names, own_methods
 from rtgs.methods.settings import MethodSettings
 from rtgs.methods.spec import MethodSpec, StageSpec
 from rtgs.train.method import (
@@ -75,6 +75,7 @@ __all__ = [
     "StepEvent",
     "create_method",
     "find_method",
+    "is_own",
     "method_names",
     "own_methods",
 ]

@@ -17,6 +17,7 @@ from rtgs.methods import envgs, gs2d, gs3d, rtgs
 from rtgs.methods.spec import MethodSpec
 
 ENTRY_POINTS = "rtgs.methods"
+REACHES = ()  # by name only what others install: the digest of its source is in the recipe of its steps
 _OWN = {spec.name: spec for spec in (gs2d.SPEC, gs3d.SPEC, envgs.SPEC, rtgs.SPEC)}
 
 
@@ -47,6 +48,11 @@ def find_method(name: str) -> MethodSpec:
             f"method.name is {name!r}: choose one of {', '.join(names)}, or package.module:ATTRIBUTE of your own{hint}"
         )
     return _load(place, name)
+
+
+def is_own(spec: MethodSpec) -> bool:
+    """The method is one of this package."""
+    return spec in _OWN.values()
 
 
 def _entry_points() -> dict[str, str]:

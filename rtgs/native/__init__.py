@@ -9,3 +9,4 @@ except ImportError as error:
     ) from error
 
 __all__ = ["core"]
+REACHES = ("**/*.cpp", "**/*.h", "**/*.cmake", "../../CMakeLists.txt")

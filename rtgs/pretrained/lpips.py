@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from rtgs.evaluate.metrics import checked_pair
+from rtgs.core.image_pair import checked_pair
 from rtgs.pretrained.vgg import Vgg16Features
 from rtgs.pretrained.weights import LPIPS_VGG, VGG16, WrongWeights, find_weights, read_tensors, verify_weights
 

@@ -30,6 +30,8 @@ from rtgs.report.figures import (
 from rtgs.report.layers import layer_pixels
 from rtgs.scenes.truth import ViewTruth
 
+REACHES = ("templates/*",)
+
 TARGET_BYTES = 5_000_000  # of all pictures together, as base64
 # Tried in order until the pictures fit: long side in pixels, JPEG quality.
 PICTURE_STEPS = ((800, 90), (720, 87), (600, 85), (480, 82), (360, 80), (240, 75))

@@ -7,6 +7,8 @@ from functools import cache
 from importlib import metadata
 from pathlib import Path
 
+REACHES = ()  # the commit is written down, never read by a step
+
 
 @cache
 def git_tags() -> dict[str, str]:

@@ -13,8 +13,8 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-import rtgs
 from rtgs.core.decisions import Decision
+from rtgs.core.version import VERSION
 from rtgs.native import core
 from rtgs.scenes.scene import Scene
 from rtgs.train.checkpoint import (
@@ -279,7 +279,7 @@ class Trainer:
             scene_digest=self._scene_digest,
             threads=torch.get_num_threads(),
             isa=core.isa(),
-            versions=(("rtgs", rtgs.__version__), ("torch", torch.__version__), ("python", platform.python_version())),
+            versions=(("rtgs", VERSION), ("torch", torch.__version__), ("python", platform.python_version())),
             elapsed=elapsed.wall,
             elapsed_cpu=elapsed.cpu,
             loss_average=self._averages.loss,

@@ -1,7 +1,7 @@
 """Cached pipeline steps: a pure graph of recipes, a content-addressed store, a plan, and an executor."""
 
+from rtgs.core.recipe import NOT_IN_RECIPE
 from rtgs.workflow.executors import Executor, InlineExecutor, StepResult
-from rtgs.workflow.fingerprint import NOT_IN_RECIPE
 from rtgs.workflow.outcome import StepOutcome, StepUnfinished, SweepOutcomes
 from rtgs.workflow.plan import Plan, PlannedStep, make_plan, topological
 from rtgs.workflow.remote import RemoteStore, RemoteStoreError

@@ -11,6 +11,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from rtgs.core.version import VERSION
 from rtgs.workflow.fingerprint import file_digest
 from rtgs.workflow.step import Step
 
@@ -116,9 +117,7 @@ def machine() -> dict[str, Any]:
 
 def versions() -> dict[str, str]:
     """Versions of rtgs, Python and the libraries already imported (looking them up imports nothing)."""
-    from rtgs import __version__
-
-    found = {"rtgs": __version__, "python": platform.python_version()}
+    found = {"rtgs": VERSION, "python": platform.python_version()}
     modules = {"scikit-image": "skimage"}
     for name in _VERSIONED:
         if modules.get(name, name) in sys.modules:

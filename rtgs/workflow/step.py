@@ -7,7 +7,7 @@ import logging
 import pickle
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -103,16 +103,15 @@ class Step:
 
 @dataclass(frozen=True)
 class StepKind:
-    """A step without its parameters: what a module of ``pipelines`` exports.
+    """A step without its parameters: what a module of ``pipelines.steps`` exports.
 
-    ``helpers`` are the modules (dotted, of this project) whose source belongs to the step's meaning; together with the
-    module of ``run`` they are what the guard against a forgotten version bump looks at.
+    What the module of ``run`` reaches through its imports is what the guard against a forgotten version bump looks at
+    (:mod:`rtgs.workflow.sources`).
     """
 
     name: str
     version: int
     run: StepFunction
-    helpers: tuple[str, ...] = field(default=())
 
     def step(
         self, params: Any, *upstream: Step, name: str | None = None, tools: tuple[tuple[str, str], ...] = ()

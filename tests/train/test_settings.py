@@ -5,10 +5,10 @@ import math
 import pytest
 
 from rtgs.config import compose
+from rtgs.core.recipe import canonical_json
 from rtgs.gaussians.settings import OptimizerSettings
 from rtgs.methods.settings import InterfaceSettings
 from rtgs.train.settings import LossSettings
-from rtgs.workflow.fingerprint import canonical_json
 
 
 @pytest.mark.parametrize("value", [-0.1, math.nan, math.inf])

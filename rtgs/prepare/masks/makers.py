@@ -12,6 +12,7 @@ from typing import Protocol
 import numpy as np
 from PIL import Image, PngImagePlugin
 
+from rtgs.core.recipe import canonical_json
 from rtgs.prepare.errors import PrepareError
 from rtgs.prepare.masks.detect import Box, Detector, PromptTokenizer
 from rtgs.prepare.masks.drawn import Cutout, read_drawing
@@ -29,7 +30,6 @@ from rtgs.scenes.capture import Capture, CaptureView, list_some
 from rtgs.scenes.digest import content_hash
 from rtgs.scenes.images import image_size, nearest_resize, read_mask, read_photo, same_aspect
 from rtgs.scenes.undistort import project, unproject
-from rtgs.workflow.fingerprint import canonical_json
 
 CACHE_VERSION = 1  # of single masks by networks
 _PLANE_SIDE = 1600  # pixels, long side of the masks of panes; the import brings them to the size of the views

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rtgs.core.recipe import canonical_json
 from rtgs.prepare.errors import PrepareError
 from rtgs.prepare.normals.adapters import NormalAdapter
 from rtgs.prepare.normals.maps import (
@@ -33,7 +34,6 @@ from rtgs.scenes.importers.registry import read_capture
 from rtgs.scenes.settings import SceneSettings
 from rtgs.scenes.splits import select_views
 from rtgs.scenes.undistort import Lens
-from rtgs.workflow.fingerprint import canonical_json
 
 REPORT_FILE = "normals.json"
 MAPS_DIR = "normals"

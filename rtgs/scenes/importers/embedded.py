@@ -6,6 +6,8 @@ from pathlib import Path
 
 from rtgs.scenes.settings import CaptureError
 
+REACHES = ()  # the recipe of an import holds the digest of the capture
+
 
 def embedded_folder() -> Path:
     """The folder that holds the embedded captures."""

@@ -14,6 +14,7 @@ from types import UnionType
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 SCENES = Path(__file__).parent / "scenes"
+REACHES = ("scenes/*.toml",)
 
 KINDS = ("lathe", "box", "sphere", "knot", "plane", "dome", "sculpt", "kernels")
 MATERIALS = ("diffuse", "glossy", "mirror", "thin_glass", "glass")
