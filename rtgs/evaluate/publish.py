@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from rtgs.core.refuse import refuse_unknown
 from rtgs.evaluate.records import EvaluationTable
 from rtgs.evaluate.tables import PAPER_SCORES, PaperScore
 
@@ -23,8 +24,7 @@ class TableSpec:
     data: str = OWN_DATA  # one of DATA_KINDS
 
     def __post_init__(self) -> None:
-        if self.data not in DATA_KINDS:
-            raise ValueError(f"table.data={self.data!r} is unknown: choose one of {', '.join(DATA_KINDS)}")
+        refuse_unknown("table.data", self.data, DATA_KINDS)
 
 
 @dataclass(frozen=True)

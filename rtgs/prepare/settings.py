@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-from rtgs.prepare.errors import PrepareError, check_choice
+from rtgs.core.errors import RtgsError
+from rtgs.core.refuse import refuse_below, refuse_unknown, refuse_unless
 from rtgs.prepare.normals.adapters import ADAPTERS, NormalAdapter
 
 USE = ("auto", "always", "never")
@@ -128,7 +129,7 @@ class SfmSettings:
     """Poses from photos or a video.
 
     Raises:
-        PrepareError: a value outside its documented range.
+        RtgsError: a value outside its documented range.
     """
 
     use: str = "auto"
@@ -158,7 +159,7 @@ class SfmSettings:
             ("matching.pairs", self.matching.pairs, MATCHING),
             ("mapping.mapper", self.mapping.mapper, MAPPERS),
         ):
-            check_choice(f"sfm.{key}", value, known)
+            refuse_unknown(f"sfm.{key}", value, known)
         for key, value, least in (
             ("features.max_side", self.features.max_side, 64),
             ("features.max_features", self.features.max_features, 100),
@@ -173,10 +174,9 @@ class SfmSettings:
             ("min_photos", self.min_photos, 2),
             ("video.max_frames", self.video.max_frames, 3),
         ):
-            if not value >= least:
-                raise PrepareError(f"setting sfm.{key}={value}: must be at least {least}")
-        if not 0 < self.video.shift < 1:
-            raise PrepareError(f"setting sfm.video.shift={self.video.shift}: must lie between 0 and 1 (long sides)")
+            refuse_below(f"sfm.{key}", value, least)
+        shift = self.video.shift
+        refuse_unless(0 < shift < 1, "sfm.video.shift", shift, "between 0 and 1 (long sides)")
 
 
 @dataclass(frozen=True)
@@ -184,7 +184,7 @@ class NormalSettings:
     """Monocular normals for photos that have none.
 
     Raises:
-        PrepareError: a value outside its documented range.
+        RtgsError: a value outside its documented range.
     """
 
     use: str = "auto"
@@ -214,16 +214,14 @@ class NormalSettings:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "axes", tuple(self.axes))
-        check_choice("normals.use", self.use, USE)
-        check_choice("normals.model", self.model, (*ADAPTERS, "custom"))
+        refuse_unknown("normals.use", self.use, USE)
+        refuse_unknown("normals.model", self.model, (*ADAPTERS, "custom"))
         if self.model == "custom" and not self.file:
-            raise PrepareError("setting normals.model=custom needs normals.file, the ONNX file")
-        if not self.max_side >= 32:
-            raise PrepareError(f"setting normals.max_side={self.max_side}: must be at least 32")
-        if self.tile and not self.tile >= 64:
-            raise PrepareError(f"setting normals.tile={self.tile}: give 0 (no tiles) or at least 64 pixels")
-        if not 0 <= self.tile_overlap <= 0.5:
-            raise PrepareError(f"setting normals.tile_overlap={self.tile_overlap}: must lie between 0 and 0.5")
+            raise RtgsError("normals.model=custom needs normals.file, the ONNX file")
+        refuse_below("normals.max_side", self.max_side, 32)
+        tile, overlap = self.tile, self.tile_overlap
+        refuse_unless(tile == 0 or tile >= 64, "normals.tile", tile, "0 (no tiles) or at least 64 pixels")
+        refuse_unless(0 <= overlap <= 0.5, "normals.tile_overlap", overlap, "between 0 and 0.5")
 
     @property
     def declared(self) -> NormalAdapter:

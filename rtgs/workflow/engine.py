@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rtgs.core.errors import RtgsError
+from rtgs.core.refuse import refuse_unknown
 from rtgs.track import open_tracking
 from rtgs.workflow.executors import InlineExecutor
 from rtgs.workflow.outcome import StepOutcome, SweepOutcomes
@@ -61,8 +62,7 @@ class EngineSettings:
     """How many workers may die at one step before it counts as failed."""
 
     def __post_init__(self) -> None:
-        if self.kind not in ENGINES:
-            raise RtgsError(f"hydra.launcher.kind={self.kind!r} is unknown: choose one of {', '.join(ENGINES)}")
+        refuse_unknown("hydra.launcher.kind", self.kind, ENGINES)
         if self.workers < 1 or self.threads < 0 or self.retries < 0:
             raise RtgsError(
                 f"hydra.launcher: workers={self.workers} must be at least 1, threads={self.threads} and "

@@ -139,8 +139,8 @@ def test_a_full_disk_is_told_and_the_next_run_goes_on(scene, tmp_path, monkeypat
     [
         (["scene=nope"], "there is no scene 'nope'; rtgs describes ball_statue, "),
         (["width=64"], "name a scene, scene=NAME"),
-        (["scene=spheres", "width=0"], "width=0 is out of range, give 8 or more"),
-        (["scene=spheres", "samples=0"], "samples=0 is out of range"),
+        (["scene=spheres", "width=0"], "width=0 must be in 8..8192"),
+        (["scene=spheres", "samples=0"], "samples=0 must be in 1.."),
         (["scene=spheres", "truth=some"], "truth='some' is unknown: choose one of all, test, none"),
         (["scene=spheres", "widht=64"], "Did you mean width"),
         (["scene=spheres", "variant=cuda_rgb"], "variant 'cuda_rgb' is not used here"),

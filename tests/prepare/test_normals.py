@@ -16,6 +16,7 @@ onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
 
 from pipelines.cli.main import main  # noqa: E402
+from rtgs.core.errors import RtgsError  # noqa: E402
 from rtgs.prepare.errors import PrepareError  # noqa: E402
 from rtgs.prepare.masks.makers import file_digest  # noqa: E402
 from rtgs.prepare.normals.adapters import ADAPTERS, NormalAdapter  # noqa: E402
@@ -312,17 +313,17 @@ def test_a_wrong_model_is_a_message(tmp_path, capture):
 @pytest.mark.parametrize(
     ("make_settings", "message"),
     [
-        (lambda: NormalAdapter(axes=("+x", "+y", "+y")), "give three of"),
+        (lambda: NormalAdapter(axes=("+x", "+y", "+y")), "must be three of"),
         (lambda: NormalAdapter(fit="crop"), "normals.adapter.fit='crop'"),
         (lambda: NormalSettings(model="dsin"), "did you mean 'dsine'"),
         (lambda: NormalSettings(model="custom"), "needs normals.file"),
-        (lambda: NormalSettings(tile=20), "normals.tile=20: give 0"),
+        (lambda: NormalSettings(tile=20), "normals.tile=20 must be 0"),
         (lambda: NormalSettings(tile_overlap=0.7), "normals.tile_overlap=0.7"),
         (lambda: find_network(NormalSettings(file="/nowhere/net.onnx")), "does not exist"),
     ],
 )
 def test_settings_out_of_range_are_refused(make_settings, message):
-    with pytest.raises(PrepareError, match=message):
+    with pytest.raises(RtgsError, match=message):
         make_settings()
 
 

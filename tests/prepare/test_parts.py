@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from rtgs.core.errors import RtgsError
 from rtgs.prepare.errors import PrepareError
 from rtgs.prepare.poses import pairs
 from rtgs.prepare.poses.compare import compare_poses
@@ -146,12 +147,12 @@ def test_the_gap_around_a_scene():
     [
         (lambda: SfmSettings(use="allways"), "sfm.use='allways' is unknown.*did you mean 'always'"),
         (lambda: SfmSettings(matching=MatchingSettings(pairs="all")), "sfm.matching.pairs='all'"),
-        (lambda: SfmSettings(min_photos=1), "sfm.min_photos=1: must be at least 2"),
+        (lambda: SfmSettings(min_photos=1), "sfm.min_photos=1 must be at least 2"),
         (lambda: SfmSettings(video=VideoSettings(shift=2.0)), "sfm.video.shift=2.0"),
     ],
 )
 def test_settings_out_of_range_are_refused(make, message):
-    with pytest.raises(PrepareError, match=message):
+    with pytest.raises(RtgsError, match=message):
         make()
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rtgs.prepare.errors import PrepareError, check_choice
+from rtgs.core.refuse import refuse_unknown, refuse_unless
 
 _AXES = ("+x", "-x", "+y", "-y", "+z", "-z")
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
@@ -17,7 +17,7 @@ class NormalAdapter:
     """How a normal network wants its picture and what its numbers mean.
 
     Raises:
-        PrepareError: axes that are not three different ones, an unknown way to fit.
+        RtgsError: axes that are not three different ones, an unknown way to fit.
     """
 
     input: str = ""
@@ -46,11 +46,11 @@ class NormalAdapter:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "axes", tuple(self.axes))
-        check_choice("normals.adapter.fit", self.fit, ("multiple", "stretch", "pad"))
-        if len(self.axes) != 3 or {axis[-1:] for axis in self.axes} != set("xyz") or set(self.axes) - set(_AXES):
-            raise PrepareError(
-                f"setting normals.adapter.axes={list(self.axes)}: give three of {', '.join(_AXES)}, one for each axis"
-            )
+        refuse_unknown("normals.adapter.fit", self.fit, ("multiple", "stretch", "pad"))
+        each_once = len(self.axes) == 3 and {axis[-1:] for axis in self.axes} == set("xyz")
+        known = not set(self.axes) - set(_AXES)
+        allowed = f"three of {', '.join(_AXES)}, one for each axis"
+        refuse_unless(each_once and known, "normals.adapter.axes", list(self.axes), allowed)
 
     @property
     def matrix(self) -> np.ndarray:
