@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
+from rtgs.core.decisions import Decision
 from rtgs.train.settings import MethodSettings, ScheduleSettings
 
 if TYPE_CHECKING:
@@ -23,14 +24,6 @@ class Stage:
     name: str
     from_step: int  # first step of the stage
     until: int  # first step that no longer belongs to it
-
-
-@dataclass(frozen=True)
-class Decision:
-    """Something a recipe could do and does not (or does differently), decided once: shown in the log and the report."""
-
-    what: str
-    why: str
 
 
 @dataclass(frozen=True)
