@@ -124,7 +124,7 @@ def run(words: list[str]) -> int:
 
 def plan(words: list[str]) -> int:
     """``rtgs plan``: the steps of a run or of a sweep, cached or not, and why not."""
-    from pipelines.planning.plan import HELP, plan_of_words
+    from pipelines.cli.plan import HELP, plan_of_words
 
     if words[:1] in (["-h"], ["--help"]):
         print(HELP)

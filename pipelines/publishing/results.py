@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from filelock import FileLock
 
+from pipelines.planning.rows import plan_rows
 from pipelines.steps.evaluate import TABLE_CSV, TABLE_JSON
 from pipelines.steps.pictures import final_pictures, training_pictures
 from pipelines.steps.report import PAGE
@@ -27,9 +28,6 @@ from rtgs.prepare.poses.quality import PICTURE_FILE, REPORT_FILE
 from rtgs.track import RunInfo, Tracker
 from rtgs.track.source import git_tags, installed
 from rtgs.workflow import Plan, StepResult, Store
-
-if TYPE_CHECKING:
-    from pipelines.planning.preparation import SkippedStep
 
 RUN_FILE = "run.json"
 CONFIG_FILE = "config.yaml"
@@ -277,22 +275,6 @@ def _track_png(tracker: Tracker, name: str, path: Path) -> None:
 
     if path.is_file():
         tracker.image(name, np.asarray(Image.open(path).convert("RGB")))
-
-
-def plan_rows(plan: Plan, skipped: Sequence[SkippedStep] = ()) -> list[Mapping[str, str]]:
-    """One row per step of a plan, after those that are not needed."""
-    rows: list[Mapping[str, str]] = [
-        {"step": step.name, "key": "", "state": "skipped", "why": step.why} for step in skipped
-    ]
-    return rows + [
-        {
-            "step": planned.step.name,
-            "key": planned.step.fingerprint[:12],
-            "state": "cached" if planned.hit else "to fetch" if planned.remote else "to run",
-            "why": planned.reason,
-        }
-        for planned in plan
-    ]
 
 
 def report_page(folder: Path, store: Store) -> Path:
