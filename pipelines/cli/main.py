@@ -116,7 +116,7 @@ def run(words: list[str]) -> int:
 
         run_synthesize(words[1:])
         return 0
-    from pipelines.cli.app import run_hydra
+    from pipelines.cli.hydra_run import run_hydra
 
     run_hydra(words)
     return 0
