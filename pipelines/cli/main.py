@@ -112,7 +112,7 @@ def _raised_in_project(trace: TracebackType | None) -> bool:
 def run(words: list[str]) -> int:
     """``rtgs run``: everything after it goes to Hydra."""
     if words[:1] == ["synthesize"]:
-        from pipelines.steps.synthesize import run_synthesize
+        from pipelines.cli.synthesize import run_synthesize
 
         run_synthesize(words[1:])
         return 0

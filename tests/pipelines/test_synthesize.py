@@ -16,7 +16,7 @@ from PIL import Image
 pytest.importorskip("mitsuba", reason="path tracing needs the extra 'synthetic'")
 
 from pipelines.cli.main import main
-from pipelines.steps.synthesize import LineDisplay
+from pipelines.steps.display import LineDisplay
 from rtgs.scenes.scene import load_scene
 from rtgs.scenes.settings import SceneSettings
 from rtgs.scenes.synthetic import capture as captures
@@ -216,7 +216,7 @@ def test_help_names_scenes_and_keys(capsys):
 
 def test_remaining_time_counts_only_what_was_done_now(monkeypatch, capsys):
     clock = iter([100.0, 110.0, 130.0])
-    monkeypatch.setattr("pipelines.steps.synthesize.time.monotonic", lambda: next(clock))
+    monkeypatch.setattr("pipelines.steps.display.time.monotonic", lambda: next(clock))
     display = LineDisplay()
     for share in (0.5, 0.6, 0.8):  # half was finished earlier
         display.update("room view", share)
