@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from pipelines.steps import extract_mesh
 from pipelines.steps.evaluate import TABLE_JSON
+from pipelines.steps.render import RenderTimes
 from pipelines.steps.training import last_training, read_history, read_summary
 from pipelines.steps.views import read_render
 from rtgs.core.decisions import Decision
@@ -73,6 +74,7 @@ def report(params: ReportParams, context: StepContext) -> None:
         config=tuple(ConfigLine(key, *both) for key, both in sorted(params.config.items())),
         machine={key: str(value) for key, value in (manifest.machine | manifest.versions).items()},
         mesh=None if mesh is None else _mesh(inputs["extract_mesh"], mesh),
+        timed="per view, maps included" if RenderTimes.read(inputs["render"]).with_maps else "per view",
     )
     size = write_report(context.out / PAGE, data)
     context.log.info("report of %.1f MB", size / 1e6)

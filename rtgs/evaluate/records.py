@@ -37,7 +37,7 @@ METRICS = (
     "psnr_8bit",
     "ssim_8bit",
     "lpips_01_8bit",
-    "render_seconds",
+    "render_seconds",  # of the image with the maps that the run keeps of it; artifacts of older versions: of the image
 )
 
 

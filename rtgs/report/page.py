@@ -102,6 +102,7 @@ class ReportData:
     config: tuple[ConfigLine, ...] = ()
     machine: Mapping[str, str] = field(default_factory=dict)  # processor, cores, threads, instruction set, versions
     mesh: MeshFigure | None = None
+    timed: str = "per view"  # what the time of rendering is of
 
 
 @dataclass(frozen=True)

@@ -114,7 +114,9 @@ def test_a_run_leaves_what_people_look_at(first):
     table = json.loads((first / "metrics.json").read_text())
     assert table["facts"]["steps"] == 12
     assert table["mean"]["psnr"] > 5
-    assert (first / "report.html").read_text().lstrip().lower().startswith("<!doctype html>")
+    page = (first / "report.html").read_text()
+    assert page.lstrip().lower().startswith("<!doctype html>")
+    assert "per view, maps included" in page  # what was timed
 
 
 def test_a_second_run_only_reads_the_cache_and_says_so(first, words, capsys):
