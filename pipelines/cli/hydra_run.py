@@ -111,15 +111,15 @@ def run_hydra(words: Sequence[str]) -> HydraApp:
     options = parser.parse_args(friendly_overrides(words))
     _check(options)
     app, name = HydraApp(), options.config_name or "config"
-    with _hydra(options) as hydra:
-        if _asks(options):
-            _answer(hydra, name, options, parser)
-            return app
-        try:
+    try:
+        with _hydra(options) as hydra:
+            if _asks(options):
+                _answer(hydra, name, options, parser)
+                return app
             _start(hydra, name, options, app)
-        finally:
-            if text := app.summary(words):
-                print(f"\n{text}")
+    finally:  # the summary composes, so Hydra is gone by now
+        if text := app.summary(words):
+            print(f"\n{text}")
     if app.error is not None:
         raise app.error
     return app

@@ -290,6 +290,27 @@ def test_mistakes_are_one_message_without_traceback(words, override, expected, c
     assert "Traceback" not in errors
 
 
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (["--multirun", "--cfg", "job"], "--multirun and --cfg exclude each other"),
+        (["--resolve"], "--resolve goes with --cfg or --help only"),
+        (["--config-dir", "/no/such/folder"], "--config-dir /no/such/folder is no folder"),
+        (["--experimental-rerun", "job.pickle"], "--experimental-rerun is not offered"),
+    ],
+)
+def test_options_that_make_no_sense_are_one_message(options, expected, capsys):
+    assert main(["run", *options]) == 1
+    assert expected in capsys.readouterr().err
+
+
+def test_a_composed_config_is_printed_and_nothing_runs(words, root, capsys):
+    before = sorted((root / "runs").glob("*"))
+    assert main([*words, "seed=41", "--cfg", "job"]) == 0
+    assert yaml.safe_load(capsys.readouterr().out)["seed"] == 41
+    assert sorted((root / "runs").glob("*")) == before
+
+
 def test_a_broken_file_of_ones_own_is_named(words, tmp_path, capsys):
     (tmp_path / "scene").mkdir()
     (tmp_path / "scene" / "mine.yaml").write_text("name: [\n")
