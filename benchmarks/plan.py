@@ -22,7 +22,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from benchmarks.machine import machine
-from pipelines.planning.plan import Job, MergedJobs, merge_jobs, merged_table
+from pipelines.cli.plan import merged_table
+from pipelines.planning.plan import Job, MergedJobs, merge_jobs
 from rtgs.config.sweep import compose_jobs
 from rtgs.workflow import Plan, Step, Store, make_plan, topological
 from rtgs.workflow.manifest import FileRecord, Manifest

@@ -19,10 +19,11 @@ from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, open_dict
 
 from pipelines.planning.plan import Job
-from pipelines.planning.sweep import prepared, run_merged
+from pipelines.planning.sweep import SweepTask, run_merged
 from rtgs.config.compose import choices_from, without_hydra
 from rtgs.config.convert import to_run_config
 from rtgs.config.schema import open_schema
+from rtgs.core.errors import RtgsError
 from rtgs.workflow.engine import EngineSettings
 
 log = logging.getLogger("rtgs")
@@ -38,11 +39,13 @@ class RtgsDaskLauncher(Launcher):
             settings[name] = list(settings.get(name, []))
         self.settings = EngineSettings(**settings)
         self._context: HydraContext | None = None
-        self._task: TaskFunction | None = None
+        self._task: SweepTask | None = None
         self._config: DictConfig | None = None
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
         """Hydra hands over what a launcher needs."""
+        if not isinstance(task_function, SweepTask):
+            raise RtgsError(f"hydra/launcher={NAME} runs the jobs of `rtgs run` only, not {task_function!r}")
         self._context, self._task, self._config = hydra_context, task_function, config
 
     def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> Sequence[JobReturn]:
@@ -55,20 +58,19 @@ class RtgsDaskLauncher(Launcher):
         Path(str(self._config.hydra.sweep.dir)).mkdir(parents=True, exist_ok=True)
         composed = [self._compose(number, words, initial_job_idx) for number, words in enumerate(job_overrides)]
         outcomes = run_merged([job for config in composed if (job := _job(config)) is not None], self.settings)
-        returns = []
-        with prepared(outcomes):
-            for words, config in zip(job_overrides, composed):
-                log.info("#%s: %s", config.hydra.job.num, " ".join(filter_overrides(words)))
-                returns.append(
-                    run_job(
-                        hydra_context=self._context,
-                        task_function=self._task,
-                        config=config,
-                        job_dir_key="hydra.sweep.dir",
-                        job_subdir_key="hydra.sweep.subdir",
-                    )
+        task, returns = self._task.after(outcomes), []
+        for words, config in zip(job_overrides, composed):
+            log.info("#%s: %s", config.hydra.job.num, " ".join(filter_overrides(words)))
+            returns.append(
+                run_job(
+                    hydra_context=self._context,
+                    task_function=task,
+                    config=config,
+                    job_dir_key="hydra.sweep.dir",
+                    job_subdir_key="hydra.sweep.subdir",
                 )
-                configure_log(self._config.hydra.hydra_logging, self._config.hydra.verbose)
+            )
+            configure_log(self._config.hydra.hydra_logging, self._config.hydra.verbose)
         return returns
 
     def _compose(self, number: int, words: Sequence[str], first: int) -> DictConfig:

@@ -112,11 +112,11 @@ def _raised_in_project(trace: TracebackType | None) -> bool:
 def run(words: list[str]) -> int:
     """``rtgs run``: everything after it goes to Hydra."""
     if words[:1] == ["synthesize"]:
-        from pipelines.steps.synthesize import run_synthesize
+        from pipelines.cli.synthesize import run_synthesize
 
         run_synthesize(words[1:])
         return 0
-    from pipelines.cli.app import run_hydra
+    from pipelines.cli.hydra_run import run_hydra
 
     run_hydra(words)
     return 0
@@ -124,7 +124,7 @@ def run(words: list[str]) -> int:
 
 def plan(words: list[str]) -> int:
     """``rtgs plan``: the steps of a run or of a sweep, cached or not, and why not."""
-    from pipelines.planning.plan import HELP, plan_of_words
+    from pipelines.cli.plan import HELP, plan_of_words
 
     if words[:1] in (["-h"], ["--help"]):
         print(HELP)

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
 
+from pipelines.planning.inspection import Inspections
 from pipelines.planning.mask_plan import draws_panes
-from pipelines.planning.preparation import Preparation, SkippedStep, prepare
+from pipelines.planning.preparation import Preparation, prepare
 from pipelines.planning.transparent import Transparency, find_transparency
 from pipelines.steps import (
     evaluate,
@@ -24,6 +25,7 @@ from pipelines.steps import (
 )
 from pipelines.steps.training import StageParams
 from rtgs.config.schema import Choices, RunConfig
+from rtgs.core.decisions import Decision
 from rtgs.methods import find_method
 from rtgs.methods.settings import MethodSettings
 from rtgs.train.settings import ScheduleSettings
@@ -57,7 +59,7 @@ class RunGraph:
     evaluate: Step
     report: Step
     mesh: Step | None = None
-    skipped: tuple[SkippedStep, ...] = ()
+    skipped: tuple[Decision, ...] = ()  # ``what`` is the name of the step
 
     @property
     def targets(self) -> tuple[Step, ...]:
@@ -65,17 +67,21 @@ class RunGraph:
         return (self.report,)
 
 
-def build_graph(config: RunConfig, choices: Choices) -> RunGraph:
+def build_graph(config: RunConfig, choices: Choices, inspections: Inspections | None = None) -> RunGraph:
     """The steps of ``rtgs run`` for this config. Reads the capture's poses and hashes its files, runs nothing.
+
+    ``inspections``: of captures that other jobs of the same plan have looked at; None: this is the only job.
 
     Raises:
         CaptureError: the capture cannot be read.
+        PrepareError: it has no poses and none may or can be looked for.
         ValueError: no method of this name.
     """
     config = _as_asked(config)
-    prepared = prepare(config)
+    inspection = (inspections or Inspections()).of(config.scene, config.sfm)
+    prepared = prepare(config, inspection)
     scene = prepared.scene
-    transparency = find_transparency(config, prepared)
+    transparency = find_transparency(config, inspection, prepared)
     training, object_mesh = _training(config, prepared, transparency.present)
     rendered = render.STEP.step(render.RenderParams(), scene, *training)
     measured = evaluate.STEP.step(
@@ -103,17 +109,16 @@ def _as_asked(config: RunConfig) -> RunConfig:
     return replace(config, scene=replace(config.scene, masks_dir=""))
 
 
-def _left_out(config: RunConfig, transparency: Transparency, object_mesh: Step | None) -> tuple[SkippedStep, ...]:
+def _left_out(config: RunConfig, transparency: Transparency, object_mesh: Step | None) -> tuple[Decision, ...]:
     """What a run of a method with a third stage does without, and why."""
     if object_mesh is None:
         late = "method.transmittance.start leaves it no step"
         why = late if transparency.present else transparency.why
         left = next((stage for stage in find_method(config.method.name).stages if stage.needs_object), None)
-        return () if left is None else (SkippedStep(train.kind_of(left).name, why),)
+        return () if left is None else (Decision(train.kind_of(left).name, why),)
     if config.mesh.extract:
-        return (
-            SkippedStep("scene mesh", "extract_mesh makes the transparent object's mesh, which the third stage needs"),
-        )
+        why = "extract_mesh makes the transparent object's mesh, which the third stage needs"
+        return (Decision("scene mesh", why),)
     return ()
 
 
@@ -160,11 +165,11 @@ def method_label(choices: Choices) -> str:
     return choices.method if choices.ablation in ("", "none") else f"{choices.method}, {choices.ablation}"
 
 
-def _report_params(config: RunConfig, choices: Choices, skipped: tuple[SkippedStep, ...]) -> report.ReportParams:
+def _report_params(config: RunConfig, choices: Choices, skipped: tuple[Decision, ...]) -> report.ReportParams:
     values, defaults = shown_values(config), shown_values(RunConfig())
     lines = {key: (str(values[key]), str(defaults.get(key, ""))) for key in sorted(values)}
     title = f"{config.scene.name}: {method_label(choices)}, {choices.preset}"
-    decisions = tuple((f"no {step.name} step", step.why) for step in skipped)
+    decisions = tuple((f"no {step.what} step", step.why) for step in skipped)
     return report.ReportParams(title, command(choices), lines, decisions)
 
 

@@ -6,12 +6,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
+from pipelines.planning.inspection import Inspection
 from pipelines.steps import import_scene, masks
 from pipelines.steps.normals import photo_settings
 from rtgs.config.schema import RunConfig
 from rtgs.prepare.errors import PrepareError
 from rtgs.prepare.source import Source
-from rtgs.scenes.settings import SceneSettings
 from rtgs.workflow import Step
 
 
@@ -23,7 +23,7 @@ class MaskPlan(NamedTuple):
     why: str
 
 
-def plan_masks(config: RunConfig, source: Source) -> MaskPlan:
+def plan_masks(config: RunConfig, inspection: Inspection) -> MaskPlan:
     """Decide.
 
     Raises:
@@ -38,19 +38,19 @@ def plan_masks(config: RunConfig, source: Source) -> MaskPlan:
     if settings.source != "auto":
         if settings.source == "grounded_sam2":
             find_networks(settings)
-        _refuse_early_forms(config, source)
+        _refuse_early_forms(config, inspection.source)
         return MaskPlan(settings.source, "")
-    return _automatic(config, source)
+    return _automatic(config, inspection)
 
 
-def _automatic(config: RunConfig, source: Source) -> MaskPlan:
+def _automatic(config: RunConfig, inspection: Inspection) -> MaskPlan:
     from rtgs.prepare.masks.drawn import drawn_kinds
     from rtgs.prepare.masks.makers import find_networks
     from rtgs.prepare.pretrained import MissingWeights
 
-    if given := _given(config, source) or _no_glass(source):
+    if given := inspection.given_masks or _no_glass(inspection.source):
         return MaskPlan("", given)
-    marks = _folder(source) / config.masks.drawn.file
+    marks = inspection.folder / config.masks.drawn.file
     if marks.is_file():
         kinds = drawn_kinds(marks)
         return MaskPlan("polygon" if kinds == ("panes",) else "grabcut" if kinds == ("cutouts",) else "drawn", "")
@@ -64,19 +64,6 @@ def _automatic(config: RunConfig, source: Source) -> MaskPlan:
         hint = f"; `rtgs weights status` says where to get it, {marks.name} beside the photos does without"
         return MaskPlan("", f"{error}".split("; searched")[0] + hint)
     return MaskPlan("grounded_sam2", "")
-
-
-def _given(config: RunConfig, source: Source) -> str:
-    """In words, where the capture brings masks."""
-    from rtgs.scenes.importers.registry import read_capture
-
-    scene = config.scene
-    if not source.has_poses:
-        there = bool(scene.masks_dir) and (_folder(source) / scene.masks_dir).is_dir()
-        return f"masks are given ({scene.masks_dir}/)" if there else ""
-    views = read_capture(scene).views
-    given = sum(view.mask is not None for view in views)
-    return f"masks are given ({given} of {len(views)} photos)" if given else ""
 
 
 def _no_glass(source: Source) -> str:
@@ -110,12 +97,12 @@ def _refuse_early_forms(config: RunConfig, source: Source) -> None:
         )
 
 
-def _folder(source: Source) -> Path:
-    return source.path if source.path.is_dir() else source.path.parent
-
-
 def mask_step(
-    config: RunConfig, source: Source, method: str, imported: import_scene.ImportParams, before: tuple[Step, ...]
+    config: RunConfig,
+    inspection: Inspection,
+    method: str,
+    imported: import_scene.ImportParams,
+    before: tuple[Step, ...],
 ) -> Step:
     """The step for a way that was decided on; hashes what it reads.
 
@@ -135,15 +122,14 @@ def mask_step(
         found = find_networks(settings)
         files = tuple(map(str, (found.detector, found.tokenizer, found.encoder, found.decoder)))
         tools = (*found.digests, ("onnxruntime", version("onnxruntime")))
-    scene = photo_settings(imported.settings)
     params = masks.MaskParams(
         method,
         recipe,
-        scene,
-        "" if before else _capture_digest(imported, scene),
-        _marks_digest(config, method, _folder(source)),
+        photo_settings(imported.settings),
+        "" if before else inspection.photo_digest,
+        _marks_digest(config, method, inspection.folder),
         imported.path,
-        str(_folder(source)),
+        str(inspection.folder),
         files,
         str(Path(config.paths.store) / "single_masks"),
     )
@@ -153,12 +139,6 @@ def mask_step(
 def draws_panes(step: Step) -> bool:
     """The step makes masks from marks that may be flat panes: the object's mesh takes their planes."""
     return isinstance(step.params, masks.MaskParams) and step.params.method in ("polygon", "drawn")
-
-
-def _capture_digest(imported: import_scene.ImportParams, scene: SceneSettings) -> str:
-    from rtgs.scenes.digest import capture_digest
-
-    return capture_digest(replace(scene, path=imported.path))
 
 
 def _marks_digest(config: RunConfig, method: str, folder: Path) -> str:

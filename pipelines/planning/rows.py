@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from pipelines.planning.preparation import SkippedStep
+from rtgs.core.decisions import Decision
 from rtgs.workflow import Plan
 
 
-def plan_rows(plan: Plan, skipped: Sequence[SkippedStep] = ()) -> list[Mapping[str, str]]:
-    """One row per step of a plan, after those that are not needed."""
+def plan_rows(plan: Plan, skipped: Sequence[Decision] = ()) -> list[Mapping[str, str]]:
+    """One row per step of a plan, after those that are not needed; ``what`` of these is the name of the step."""
     rows: list[Mapping[str, str]] = [
-        {"step": step.name, "key": "", "state": "skipped", "why": step.why} for step in skipped
+        {"step": step.what, "key": "", "state": "skipped", "why": step.why} for step in skipped
     ]
     return rows + [
         {

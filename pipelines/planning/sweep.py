@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, Protocol, runtime_checkable
 
-from hydra.experimental.callback import Callback
+from hydra.types import TaskFunction
 from omegaconf import DictConfig
 
 from pipelines.planning.plan import Job, describe, merge_jobs, remote_store
@@ -24,7 +22,6 @@ from rtgs.workflow.engine import DaskExecutor, EngineSettings, WorkerJob, open_c
 
 log = logging.getLogger("rtgs")
 _HERE = ("BasicLauncher", "RtgsDaskLauncher")  # run jobs in the process that starts the sweep
-_PREPARED: ContextVar[SweepOutcomes | None] = ContextVar("prepared sweep", default=None)
 
 
 @dataclass(frozen=True)
@@ -36,9 +33,23 @@ class Sweep:
     folder: Path
     elsewhere: bool = False  # its jobs run in processes of their own
 
+    @staticmethod
+    def of(hydra: Any) -> Sweep:
+        """The sweep that a composed ``hydra`` node is of: the same in the process that starts it and in its jobs."""
+        folder = Path(str(hydra.sweep.dir)).absolute()
+        identity = f"{folder.parent.name}_{folder.name}"
+        experiment = hydra.runtime.choices.get("experiment")
+        elsewhere = not str(hydra.launcher.get("_target_")).endswith(_HERE)
+        return Sweep(identity, f"{experiment or 'sweep'} {identity}", folder, elsewhere)
+
     def group(self, experiment: str) -> RunInfo:
         """The run that holds the jobs together in the tracker."""
         return RunInfo(experiment, self.name, f"sweep {self.id}", {"rtgs.sweep": self.id, **git_tags()})
+
+    def forget_errors(self) -> None:
+        """Before any job: remove the errors of another sweep that was given this folder."""
+        for left in self.folder.glob("error_*.txt"):
+            left.unlink(missing_ok=True)
 
     def leave_error(self, number: int, error: Exception) -> None:
         """In a job: what stopped it. Launchers with processes of their own bring only the first error back."""
@@ -53,34 +64,18 @@ class Sweep:
         return self.folder / f"error_{number}.txt"
 
 
-class SweepStart(Callback):
-    """Keeps what a sweep is in the process that starts it, whatever launcher runs the jobs (``conf/config.yaml``)."""
+@runtime_checkable
+class SweepTask(Protocol):
+    """The task function of ``rtgs run``, as a launcher that runs the merged plan first needs it."""
 
-    sweep: ClassVar[Sweep | None] = None
+    def __call__(self, composed: DictConfig) -> Any:
+        """Run one job."""
+        ...
 
-    def on_multirun_start(self, config: DictConfig, **_: object) -> None:
-        """Hydra calls this before any job."""
-        SweepStart.sweep = _sweep(config.hydra)
-        for left in SweepStart.sweep.folder.glob("error_*.txt"):  # of another sweep that was given this folder
-            left.unlink(missing_ok=True)
-
-
-def current_sweep() -> Sweep | None:
-    """The sweep that the running job belongs to; None outside of Hydra or of a sweep."""
-    from hydra.core.hydra_config import HydraConfig
-    from hydra.types import RunMode
-
-    if not HydraConfig.initialized() or (hydra := HydraConfig.get()).mode != RunMode.MULTIRUN:
-        return None
-    return _sweep(hydra)
-
-
-def _sweep(hydra: Any) -> Sweep:
-    folder = Path(str(hydra.sweep.dir)).absolute()
-    identity = f"{folder.parent.name}_{folder.name}"
-    experiment = hydra.runtime.choices.get("experiment")
-    elsewhere = not str(hydra.launcher.get("_target_")).endswith(_HERE)
-    return Sweep(identity, f"{experiment or 'sweep'} {identity}", folder, elsewhere)
+    def after(self, outcomes: SweepOutcomes) -> TaskFunction:
+        """The same for jobs whose steps a merged plan has brought: they read them, and stop with the error of the step
+        that failed."""
+        ...
 
 
 def run_merged(jobs: Sequence[Job], settings: EngineSettings) -> SweepOutcomes:
@@ -148,18 +143,3 @@ def _worker_job(config: RunConfig, settings: EngineSettings) -> WorkerJob:
         str(Path(config.paths.root)),
         tracking.uri,
     )
-
-
-@contextmanager
-def prepared(outcomes: SweepOutcomes) -> Iterator[None]:
-    """Jobs run inside read what the merged plan brought, and stop with the error of the step that failed."""
-    token = _PREPARED.set(outcomes)
-    try:
-        yield
-    finally:
-        _PREPARED.reset(token)
-
-
-def prepared_outcomes() -> SweepOutcomes:
-    """The outcomes of the merged plan this job belongs to; empty outside of one."""
-    return _PREPARED.get() or SweepOutcomes({})

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import json
+import logging
 import shutil
 from collections.abc import Sequence
-from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 from filelock import FileLock
 
 from pipelines.planning.rows import plan_rows
+from pipelines.publishing.run_record import RUN_FILE, RunRecord
 from pipelines.steps.evaluate import TABLE_CSV, TABLE_JSON
 from pipelines.steps.pictures import final_pictures, training_pictures
 from pipelines.steps.report import PAGE
@@ -27,33 +27,13 @@ from rtgs.prepare.masks.report import FILES as MASK_FILES
 from rtgs.prepare.poses.quality import PICTURE_FILE, REPORT_FILE
 from rtgs.track import RunInfo, Tracker
 from rtgs.track.source import git_tags, installed
-from rtgs.workflow import Plan, StepResult, Store
+from rtgs.workflow import Artifacts, Plan, StepResult, Store
 
-RUN_FILE = "run.json"
 CONFIG_FILE = "config.yaml"
 INSTALLED_FILE = "requirements.txt"
 _TRACKED_IMAGES = 4
+log = logging.getLogger("rtgs")
 _NOT_TOLD = ("paths.", "tracking.", "table.")  # where results go, not what they are
-
-
-@dataclass(frozen=True)
-class RunRecord:
-    """``run.json`` of a run folder."""
-
-    name: str
-    command: str
-    finished: str  # UTC, ISO 8601
-    choices: dict[str, Any]
-    steps: dict[str, str]  # fingerprint by step name
-    tracked: tuple[str, ...] = ()  # places that hold a record of this run with these steps
-
-    @staticmethod
-    def read(folder: Path) -> RunRecord | None:
-        """The record of a run folder, or None where there is none."""
-        with suppress(OSError, ValueError, TypeError):
-            record = RunRecord(**json.loads((folder / RUN_FILE).read_text(encoding="utf-8")))
-            return replace(record, tracked=tuple(record.tracked))
-        return None
 
 
 def note_tracked(folder: Path, results: Sequence[StepResult], place: str) -> None:
@@ -63,18 +43,14 @@ def note_tracked(folder: Path, results: Sequence[StepResult], place: str) -> Non
     with _folder_lock(folder):
         record = RunRecord.read(folder)
         if record is not None and record.steps == steps and place not in record.tracked:
-            _write_record(folder, replace(record, tracked=(*record.tracked, place)))
+            replace(record, tracked=(*record.tracked, place)).write(folder)
 
 
 def is_tracked(config: RunConfig, plan: Plan, place: str) -> bool:
     """Whether the tracker at ``place`` has the run of this name with these steps, by the record of its folder."""
-    record = RunRecord.read(config.paths.runs / str(config.name))
+    record = _known(config.paths.runs / str(config.name))
     steps = {planned.step.name: planned.step.fingerprint for planned in plan}
     return record is not None and record.steps == steps and place in record.tracked
-
-
-def _write_record(folder: Path, record: RunRecord) -> None:
-    (folder / RUN_FILE).write_text(json.dumps(asdict(record), indent=1) + "\n", encoding="utf-8")
 
 
 def write_run_folder(config: RunConfig, choices: Choices, command: str, results: Sequence[StepResult]) -> Path:
@@ -105,7 +81,7 @@ def _fill_run_folder(
     results: Sequence[StepResult],
     steps: dict[str, str],
 ) -> Path:
-    known = RunRecord.read(folder)
+    known = _known(folder)
     if known is not None and known.steps == steps and (folder / PAGE).is_file():
         return folder
     folder.mkdir(parents=True, exist_ok=True)
@@ -128,9 +104,17 @@ def _fill_run_folder(
         shutil.copyfile(places["masks"] / name, folder / name)
     (folder / CONFIG_FILE).write_text(config_yaml(config), encoding="utf-8")
     finished = datetime.now(UTC).isoformat(timespec="seconds")
-    record = RunRecord(str(config.name), command, finished, asdict(choices), steps)
-    _write_record(folder, record)
+    RunRecord(str(config.name), command, finished, asdict(choices), steps).write(folder)
     return folder
+
+
+def _known(folder: Path) -> RunRecord | None:
+    """The record of a run folder that this run may write; a damaged one makes the folder incomplete, and is told."""
+    try:
+        return RunRecord.read(folder)
+    except RtgsError as error:
+        log.warning("%s; the folder is written anew", error)
+        return None
 
 
 def _replace_tree(source: Path, target: Path) -> None:
@@ -229,7 +213,7 @@ def told_apart(config: RunConfig, choices: Choices) -> dict[str, str]:
     return told
 
 
-def track_end(tracker: Tracker, folder: Path, results: Sequence[StepResult]) -> None:
+def track_end(tracker: Tracker, folder: Path, results: Sequence[StepResult], artifacts: Artifacts) -> None:
     """Curves over real iterations, final figures, the per-view table, a few pictures, the files of the run folder."""
     for result in results:
         if result.step.name.startswith("train_"):
@@ -245,7 +229,7 @@ def track_end(tracker: Tracker, folder: Path, results: Sequence[StepResult]) -> 
         tracker.metrics({f"object/{name}": value for name, value in table.object.numbers().items()})
     tracker.metrics({"surfels": float(table.facts.surfels or 0)})
     tracker.table("eval", [{"view": row.view, **row.values} for row in table.rows])
-    _track_sliders(tracker, results)
+    _track_sliders(tracker, results, artifacts)
     for path in sorted((folder / "renders").glob("*.png"))[:_TRACKED_IMAGES]:
         _track_png(tracker, f"renders/{path.stem}", path)
         _track_png(tracker, f"errors/{path.stem}", folder / "errors" / path.name)
@@ -255,7 +239,7 @@ def track_end(tracker: Tracker, folder: Path, results: Sequence[StepResult]) -> 
         tracker.artifact(ply)
 
 
-def _track_sliders(tracker: Tracker, results: Sequence[StepResult]) -> None:
+def _track_sliders(tracker: Tracker, results: Sequence[StepResult], artifacts: Artifacts) -> None:
     """Fixed views and layers at several steps, the last of them as the test views were rendered."""
     from rtgs.scenes.canonical import read_scene
 
@@ -265,7 +249,8 @@ def _track_sliders(tracker: Tracker, results: Sequence[StepResult]) -> None:
         if result.step.name.startswith("train_"):
             for picture in training_pictures(result.folder):
                 tracker.image(picture.key, picture.pixels, picture.step)
-    for picture in final_pictures(read_scene(places["import_scene"]), places["render"], stage_params(last).until):
+    scene = artifacts.read(read_scene, places["import_scene"])
+    for picture in final_pictures(scene, places["render"], stage_params(last).until):
         tracker.image(picture.key, picture.pixels, picture.step)
 
 
@@ -300,14 +285,14 @@ def find_run(runs: Path, name: str | None) -> Path:
     """The folder of the named run, or of the one that finished last.
 
     Raises:
-        RtgsError: there is none.
+        RtgsError: there is none, or its record is damaged.
     """
-    found = {folder.name: record for folder in sorted(runs.glob("*")) if (record := RunRecord.read(folder))}
     if name is None:
+        found = {folder.name: record for folder in sorted(runs.glob("*")) if (record := RunRecord.read(folder))}
         if not found:
             raise RtgsError(f"no finished run in {runs}; start one with `rtgs run`")
-        name = max(found, key=lambda each: found[each].finished)
-    elif name not in found:
-        listed = ", ".join(found) or "none"
+        return runs / max(found, key=lambda each: found[each].finished)
+    if RunRecord.read(runs / name) is None:
+        listed = ", ".join(path.parent.name for path in sorted(runs.glob(f"*/{RUN_FILE}"))) or "none"
         raise RtgsError(f"no finished run {name!r} in {runs}; there is {listed}")
     return runs / name

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,10 +9,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.steps.extract_mesh import SUMMARY_FILE, why_absent
-from pipelines.steps.render import read_timed
+from pipelines.steps.render import RenderTimes, read_timed
 from pipelines.steps.training import last_training, read_summary
 from rtgs.config.schema import EvaluationConfig
+from rtgs.mesh.record import MeshRecord
 from rtgs.workflow import StepContext, StepKind
 
 if TYPE_CHECKING:
@@ -45,7 +44,7 @@ def evaluate(params: EvaluateParams, context: StepContext) -> None:
     from rtgs.evaluate.records import RunFacts, write_csv, write_json
     from rtgs.scenes.canonical import read_scene
 
-    scene = read_scene(context.inputs["import_scene"])
+    scene = context.read("import_scene", read_scene)
     if not scene.test:
         context.log.warning("nothing is measured: %s", NO_TEST_VIEWS)
     summary = read_summary(last_training(context.inputs))
@@ -53,11 +52,15 @@ def evaluate(params: EvaluateParams, context: StepContext) -> None:
         scene=scene.name,
         method=params.method,
         preset=params.preset,
-        **{key: summary[key] for key in ("steps", "surfels", "peak_memory_mb")},  # pyright: ignore[reportArgumentType]
-        train_seconds=summary["seconds"],  # pyright: ignore[reportArgumentType]
-        train_cpu_seconds=summary["cpu_seconds"],  # pyright: ignore[reportArgumentType]
+        steps=summary.steps,
+        surfels=summary.surfels,
+        train_seconds=summary.seconds,
+        train_cpu_seconds=summary.cpu_seconds,
+        peak_memory_mb=summary.peak_memory_mb,
     )
-    renders = [read_timed(context.inputs["render"], view.name, view.camera) for view in scene.test]
+    rendered = context.inputs["render"]
+    times = RenderTimes.read(rendered)
+    renders = [read_timed(rendered, times, view.name, view.camera) for view in scene.test]
     settings = EvaluationSettings(params.evaluation.lpips, params.evaluation.masked, params.evaluation.eight_bit)
     known = object_facts(context.inputs["extract_mesh"], scene) if "extract_mesh" in context.inputs else None
     table = evaluate_views(renders, scene.test, facts, settings, object_facts=known)
@@ -82,28 +85,32 @@ def object_facts(folder: Path, scene: Scene) -> ObjectFacts | None:
     from rtgs.mesh.score import container_mesh
     from rtgs.mesh.silhouettes import bounding
 
-    if why_absent(folder):
+    record = MeshRecord.read(folder)
+    if record.absent:
         return None
-    mesh, record = read_object_mesh(folder), json.loads((folder / SUMMARY_FILE).read_text(encoding="utf-8"))
-    guide, truth, distance = ObjectGuide(mesh, cache_views=0), record.get("truth") or {}, None
-    if truth and (container := container_mesh(scene.name)) is not None:
-        distance = truth["distance"] / float(np.linalg.norm(np.ptp(container.vertices, axis=0)))
+    mesh, truth, distance = read_object_mesh(folder), record.truth, None
+    guide = ObjectGuide(mesh, cache_views=0)
+    if truth is not None and (container := container_mesh(scene.name)) is not None:
+        distance = truth.distance / float(np.linalg.norm(np.ptp(container.vertices, axis=0)))
     train, test = (
         hit_shares((guide.surfaces(view.camera), mask) for view in views if (mask := bounding(view.mask)) is not None)
         for views in (scene.train, scene.test)
     )
-    front, back = (truth.get(f"{side}_within_3_percent") for side in ("front", "back"))  # NaN: no pixel to judge
     return ObjectFacts(
         source=mesh.source,
         flat=mesh.flat,
-        silhouette_iou=record.get("silhouette_iou"),
+        silhouette_iou=record.silhouette_iou,
         distance=distance,
-        front=None if front is None or math.isnan(front) else front,
-        back=None if back is None or math.isnan(back) else back,
+        front=None if truth is None else _judged(truth.front_within_3_percent),
+        back=None if truth is None else _judged(truth.back_within_3_percent),
         one_hit=train[0],
         no_hit=train[1],
         no_hit_test=test[1],
     )
+
+
+def _judged(share: float) -> float | None:
+    return None if math.isnan(share) else share
 
 
 STEP = StepKind("evaluate", 5, evaluate)

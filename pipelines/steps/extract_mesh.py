@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipelines.steps.training import last_training, load_method
+from rtgs.core.decisions import Decision
 from rtgs.core.errors import RtgsError
+from rtgs.mesh.record import MeshRecord, MeshTruth
 from rtgs.mesh.settings import ObjectSettings, TsdfSettings
 from rtgs.workflow import StepContext, StepKind
 
@@ -27,8 +28,6 @@ if TYPE_CHECKING:
 
 MESH_FILE = "mesh.ply"
 PICTURE_FILE = "mesh.png"
-SUMMARY_FILE = "mesh.json"
-ABSENT = "absent"  # in it, instead of a mesh: why there is no transparent object
 
 
 @dataclass(frozen=True)
@@ -77,10 +76,9 @@ def extract_mesh(params: ExtractMeshParams, context: StepContext) -> None:
     from rtgs.mesh.silhouettes import why_unbounded
     from rtgs.scenes.canonical import read_scene
 
-    scene = read_scene(context.inputs["import_scene"])
+    scene = context.read("import_scene", read_scene)
     if params.source and params.only_masked and (why := why_unbounded([view.mask for view in scene.train])):
-        record = {ABSENT: why, "decisions": [["no transmittance stage", why]]}
-        (context.out / SUMMARY_FILE).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+        MeshRecord(absent=why, decisions=(Decision("no transmittance stage", why),)).write(context.out)
         context.log.info("no mesh of a transparent object: %s", why)
         return
     if params.only_masked and all(view.mask is None for view in scene.train):
@@ -93,8 +91,12 @@ def extract_mesh(params: ExtractMeshParams, context: StepContext) -> None:
 
 
 def why_absent(folder: Path) -> str:
-    """Why an artifact of this step holds no mesh of the transparent object; empty: it holds one."""
-    return json.loads((folder / SUMMARY_FILE).read_text(encoding="utf-8")).get(ABSENT, "")
+    """Why an artifact of this step holds no mesh of the transparent object; empty: it holds one.
+
+    Raises:
+        RtgsError: its record is missing or damaged.
+    """
+    return MeshRecord.read(folder).absent or ""
 
 
 def _scene_mesh(method: Method, step: int, scene: Scene, params: ExtractMeshParams, context: StepContext) -> None:
@@ -105,14 +107,16 @@ def _scene_mesh(method: Method, step: int, scene: Scene, params: ExtractMeshPara
 
     views = _depth_views(method, step, scene, params)
     result = fuse_depths(views, [view.camera for view in scene.train], params.tsdf)
-    record = _fusion_record(result) | _pictured(result.mesh, scene, params, context.out)
-    record["note"] = f"Voxel {result.voxel:.4g}, depths up to {result.depth_trunc:.4g}."
+    note = f"Voxel {result.voxel:.4g}, depths up to {result.depth_trunc:.4g}."
+    record = _with_fusion(
+        MeshRecord(note=note, picture_from=_pictured(result.mesh, scene, params, context.out)), result
+    )
     if params.source:
         write_object_mesh(context.out, ObjectMesh(result.mesh, "tsdf", result.voxel, flat=False), record)
     else:
         write_mesh_ply(context.out / MESH_FILE, result.mesh)
-        counts = {"vertices": len(result.mesh.vertices), "faces": len(result.mesh.faces), "voxel": result.voxel}
-        (context.out / SUMMARY_FILE).write_text(json.dumps(counts | record, indent=1) + "\n", encoding="utf-8")
+        vertices, faces = len(result.mesh.vertices), len(result.mesh.faces)
+        replace(record, vertices=vertices, faces=faces, voxel=result.voxel).write(context.out)
     context.tracker.metrics(_sizes(result.mesh))
     context.log.info("mesh of %d triangles in %d pieces, voxel %.4g", len(result.mesh.faces), result.kept, result.voxel)
 
@@ -127,16 +131,17 @@ def _object_mesh(method: Method, step: int, scene: Scene, params: ExtractMeshPar
     drawn = "masks" in context.inputs  # of a scene whose panes somebody drew
     panes = [np.array(pane.corners) for pane in MaskReport.read(context.inputs["masks"]).panes] if drawn else []
     choice, fused = find_object_mesh(method, step, scene, params, panes)
-    record = _choice_record(choice) | _pictured(choice.mesh.mesh, scene, params, context.out)
+    truth = _against_truth(choice, scene)
+    pictured = _pictured(choice.mesh.mesh, scene, params, context.out)
+    record = replace(_choice_record(choice), picture_from=pictured, truth=truth)
     if choice.mesh.source == "tsdf":
         assert fused is not None
-        record |= _fusion_record(fused)
-    truth = _against_truth(choice, scene)
-    write_object_mesh(context.out, choice.mesh, record | {"truth": truth})
-    for what, why in choice.decisions:
-        context.log.info("%s: %s", what, why)
+        record = _with_fusion(record, fused)
+    write_object_mesh(context.out, choice.mesh, record)
+    for decision in choice.decisions:
+        context.log.info("%s", decision)
     numbers = {"silhouette_iou": choice.iou.mean, "silhouette_iou_lowest": choice.iou.lowest}
-    numbers |= {"silhouette_iou_all_pixels": choice.iou_all.mean} | truth
+    numbers |= {"silhouette_iou_all_pixels": choice.iou_all.mean} | ({} if truth is None else asdict(truth))
     numbers |= {f"silhouette_iou_{name}": value for name, value in choice.candidates.items()}
     context.tracker.metrics({f"mesh/{name}": value for name, value in numbers.items()} | _sizes(choice.mesh.mesh))
 
@@ -170,46 +175,45 @@ def find_object_mesh(
     return choice, made[-1] if made else None
 
 
-def _choice_record(choice: Choice) -> dict[str, object]:
+def _choice_record(choice: Choice) -> MeshRecord:
     """What is worth knowing of a chosen mesh."""
     kinds = {"hull": "visual hull of the masks", "tsdf": "TSDF of the depths", "given": "from the given file"}
     kind = "a flat pane" if choice.mesh.flat else kinds[choice.mesh.source]
     agreement = f"IoU with the masks {choice.iou.mean:.3f}"
     note = f"Of the transparent object: {kind}, voxel {choice.mesh.voxel:.4g}; {agreement}."
     hull = choice.hull
-    details: dict[str, object] = {}
-    if hull is not None:
-        details = {"masks_outvoted": hull.outvoted, "trimmed": hull.trimmed, "trim_views": hull.trim_views}
-    return {
-        "note": note,
-        "silhouette_iou": choice.iou.mean,
-        "silhouette_iou_lowest": choice.iou.lowest,
-        "silhouette_iou_lowest_view": choice.iou.lowest_view,
-        "silhouette_iou_all_pixels": choice.iou_all.mean,
-        "candidates": choice.candidates,
-        "decisions": [list(item) for item in choice.decisions],
-        **details,
-    }
+    return MeshRecord(
+        note=note,
+        silhouette_iou=choice.iou.mean,
+        silhouette_iou_lowest=choice.iou.lowest,
+        silhouette_iou_lowest_view=choice.iou.lowest_view,
+        silhouette_iou_all_pixels=choice.iou_all.mean,
+        candidates=choice.candidates,
+        decisions=choice.decisions,
+        masks_outvoted=None if hull is None else hull.outvoted,
+        trimmed=None if hull is None else hull.trimmed,
+        trim_views=None if hull is None else hull.trim_views,
+    )
 
 
-def _against_truth(choice: Choice, scene: Scene) -> dict[str, float]:
-    """Distances to the true container, world units, and shares of right hits over the test views; empty without it."""
+def _against_truth(choice: Choice, scene: Scene) -> MeshTruth | None:
+    """The mesh against the true container; None: nothing is known of one."""
     from rtgs.mesh.score import container_mesh, hit_score, mesh_distance
 
     views = [view for view in scene.test if view.truth is not None]
     truth = container_mesh(scene.name) if views else None
     if truth is None:
-        return {}
+        return None
     distance = mesh_distance(choice.mesh.mesh, truth)
     hits = hit_score(choice.mesh, truth, [view.camera for view in views])
-    return {
-        "distance": distance.mean,
-        "distance_to_truth": distance.accuracy,
-        "distance_from_truth": distance.completeness,
-        "front_within_3_percent": hits.front,
-        "back_within_3_percent": hits.back,
-        "normal_degrees_median": hits.normal_median,
-    }
+    return MeshTruth(
+        distance=distance.mean,
+        distance_to_truth=distance.accuracy,
+        distance_from_truth=distance.completeness,
+        front_within_3_percent=hits.front,
+        back_within_3_percent=hits.back,
+        normal_degrees_median=hits.normal_median,
+    )
 
 
 def _median_depths(method: Method, step: int, scene: Scene) -> list[Tensor]:
@@ -258,8 +262,8 @@ def _depth_views(method: Method, step: int, scene: Scene, params: ExtractMeshPar
         yield DepthView(view.camera, depth, rendered.image, buffers.alpha, mask)
 
 
-def _pictured(mesh: TriangleMesh, scene: Scene, params: ExtractMeshParams, out: Path) -> dict[str, object]:
-    """Write the picture, and the OBJ where it is asked for; where the picture was taken from."""
+def _pictured(mesh: TriangleMesh, scene: Scene, params: ExtractMeshParams, out: Path) -> str:
+    """Write the picture, and the OBJ where it is asked for; the view that the picture is seen from."""
     from rtgs.evaluate.images import write_png
     from rtgs.mesh.triangles import write_mesh_obj
     from rtgs.report.figures import mesh_picture
@@ -268,11 +272,11 @@ def _pictured(mesh: TriangleMesh, scene: Scene, params: ExtractMeshParams, out: 
     write_png(out / PICTURE_FILE, mesh_picture(mesh, view.camera), f"mesh seen from {view.name}")
     if params.obj:
         write_mesh_obj(out / "mesh.obj", mesh)
-    return {"picture_from": view.name}
+    return view.name
 
 
-def _fusion_record(result: MeshResult) -> dict[str, object]:
-    return {"depth_trunc": result.depth_trunc, "pieces_found": result.clusters, "pieces_kept": result.kept}
+def _with_fusion(record: MeshRecord, result: MeshResult) -> MeshRecord:
+    return replace(record, depth_trunc=result.depth_trunc, pieces_found=result.clusters, pieces_kept=result.kept)
 
 
 def _sizes(mesh: TriangleMesh) -> dict[str, float]:

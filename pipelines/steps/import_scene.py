@@ -20,15 +20,9 @@ class ImportParams:
     path: str = field(metadata=NOT_IN_RECIPE)
 
 
-def import_params(settings: SceneSettings) -> ImportParams:
-    """Parameters of an import; reads the capture's poses and hashes its files.
-
-    Raises:
-        CaptureError: the capture cannot be read.
-    """
-    from rtgs.scenes.digest import capture_digest
-
-    return ImportParams(replace(settings, path=""), capture_digest(settings), settings.path)
+def import_params(settings: SceneSettings, digest: str) -> ImportParams:
+    """Parameters of the import of a capture; ``digest``: of every file that the import reads."""
+    return ImportParams(replace(settings, path=""), digest, settings.path)
 
 
 def prepared_params(settings: SceneSettings, source: Path) -> ImportParams:

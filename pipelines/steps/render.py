@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipelines.steps.training import last_training, load_method
 from pipelines.steps.views import read_render, view_maps
+from rtgs.core.errors import RtgsError
+from rtgs.core.records import read_record, write_json
 from rtgs.workflow import StepContext, StepKind
 
 if TYPE_CHECKING:
@@ -18,6 +19,44 @@ if TYPE_CHECKING:
 
 TIMES_FILE = "render.json"
 GIVEN = "image_given_masks"  # of methods with a third stage: seen through the view's own mask, not the silhouette
+
+
+@dataclass(frozen=True)
+class RenderTimes:
+    """``render.json``: how long the test views took.
+
+    Attributes:
+        seconds: by the wall, by view name.
+        with_maps: the time is that of the image together with its maps; False: of the image alone.
+    """
+
+    seconds: dict[str, float]
+    with_maps: bool = False  # artifacts of older versions do not say
+
+    def of(self, view_name: str) -> float:
+        """Seconds of one view.
+
+        Raises:
+            RtgsError: the view was not rendered.
+        """
+        if view_name not in self.seconds:
+            raise RtgsError(
+                f"view {view_name!r} was not rendered: {TIMES_FILE} has {', '.join(self.seconds) or 'none'}"
+            )
+        return self.seconds[view_name]
+
+    def write(self, folder: Path) -> None:
+        """Write ``folder/render.json``."""
+        write_json(folder / TIMES_FILE, asdict(self))
+
+    @staticmethod
+    def read(folder: Path) -> RenderTimes:
+        """Read ``folder/render.json``.
+
+        Raises:
+            RtgsError: it is missing or damaged.
+        """
+        return read_record(RenderTimes, folder / TIMES_FILE)
 
 
 @dataclass(frozen=True)
@@ -33,7 +72,7 @@ def render(params: RenderParams, context: StepContext) -> None:
 
     Writes ``images/<stem>.png`` (8 bit), ``views/<stem>.safetensors`` (float32: image (3, H, W) not clamped, depth
     (H, W) z-depth divided by alpha in world units, normal (3, H, W) world frame where the method has one, alpha (H, W);
-    with a third stage also ``image_given_masks``) and ``render.json`` (seconds of each image).
+    with a third stage also ``image_given_masks``) and ``render.json`` (:class:`RenderTimes`).
     """
     import torch
     from safetensors.torch import save_file
@@ -42,47 +81,51 @@ def render(params: RenderParams, context: StepContext) -> None:
     from rtgs.methods import Mode, RenderOptions
     from rtgs.scenes.canonical import read_scene
 
-    scene = read_scene(context.inputs["import_scene"])
+    scene = context.read("import_scene", read_scene)
     method, stage = load_method(last_training(context.inputs), scene)
+    options = RenderOptions()
+    if params.maps:  # they change no bit of the image
+        options = RenderOptions(depth=True, normal="normal" in method.maps, layers=True)
     seconds: dict[str, float] = {}
     (context.out / "views").mkdir()
     for view in scene.test:
         stem = file_stem(view.name)
         with torch.no_grad():
             start = time.perf_counter()
-            rendered = method.render(view.camera, stage.until, Mode.EVALUATE, RenderOptions(), view.mask)
+            rendered = method.render(view.camera, stage.until, Mode.EVALUATE, options, view.mask)
             seconds[view.name] = time.perf_counter() - start
-            image = rendered.image
-            tensors = {"image": image.contiguous()}
+            tensors = {"image": rendered.image.contiguous()}
+            if params.maps:
+                tensors |= view_maps(rendered)
             if rendered.transparent is not None and view.mask is not None:
                 given = RenderOptions(masks="given")
                 tensors[GIVEN] = method.render(
                     view.camera, stage.until, Mode.EVALUATE, given, view.mask
                 ).image.contiguous()
-            if params.maps:
-                options = RenderOptions(depth=True, normal="normal" in method.maps, layers=True)
-                tensors |= view_maps(method.render(view.camera, stage.until, Mode.EVALUATE, options, view.mask))
         save_file(tensors, context.out / "views" / f"{stem}.safetensors")
-        write_png(context.out / "images" / f"{stem}.png", to_bytes(image))
-    (context.out / TIMES_FILE).write_text(json.dumps({"seconds": seconds}, indent=1) + "\n", encoding="utf-8")
+        write_png(context.out / "images" / f"{stem}.png", to_bytes(rendered.image))
+    RenderTimes(seconds, params.maps).write(context.out)
     if seconds:
         context.log.info("rendered %d test views, %.3f s each", len(seconds), sum(seconds.values()) / len(seconds))
 
 
-def read_timed(folder: Path, view_name: str, camera: Camera | None = None) -> TimedRender:
-    """One rendered view with the time it took; normals, in the camera's frame, only with its ``camera``."""
+def read_timed(folder: Path, times: RenderTimes, view_name: str, camera: Camera | None = None) -> TimedRender:
+    """One rendered view with the time it took; normals, in the camera's frame, only with its ``camera``.
+
+    Raises:
+        RtgsError: the view was not rendered.
+    """
     import torch
 
     from rtgs.evaluate.evaluate import TimedRender
 
-    seconds = json.loads((folder / TIMES_FILE).read_text(encoding="utf-8"))["seconds"]
     tensors = read_render(folder, view_name)
     layers = (tensors.get("reflection"), tensors.get("transmission"))
     normal = tensors.get("normal")
     if normal is not None:
         normal = None if camera is None else torch.einsum("ij,jhw->ihw", camera.rotation.float(), normal)
     surface = (tensors.get("depth"), normal)
-    return TimedRender(tensors["image"], seconds[view_name], *layers, tensors.get(GIVEN), *surface)
+    return TimedRender(tensors["image"], times.of(view_name), *layers, tensors.get(GIVEN), *surface)
 
 
 STEP = StepKind("render", 3, render)

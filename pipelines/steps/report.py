@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
@@ -11,9 +10,12 @@ from typing import TYPE_CHECKING
 
 from pipelines.steps import extract_mesh
 from pipelines.steps.evaluate import TABLE_JSON
-from pipelines.steps.train import BOUNDARY_FILE
+from pipelines.steps.render import RenderTimes
 from pipelines.steps.training import last_training, read_history, read_summary
 from pipelines.steps.views import read_render
+from rtgs.core.decisions import Decision
+from rtgs.core.records import damaged
+from rtgs.mesh.record import RECORD_FILE, MeshRecord
 from rtgs.workflow import StepContext, StepKind
 from rtgs.workflow.manifest import Manifest
 
@@ -22,7 +24,7 @@ if TYPE_CHECKING:
 
     from rtgs.evaluate.records import EvaluationTable
     from rtgs.report.figures import Curve
-    from rtgs.report.page import Decision, MeshFigure, ReportView, StepLine
+    from rtgs.report.page import MeshFigure, ReportView, StepLine
 
 PAGE = "report.html"
 
@@ -36,7 +38,8 @@ class ReportParams:
     config: dict[str, tuple[str, str]]
     """Value and default of every config key that has to do with the result."""
     decisions: tuple[tuple[str, str], ...] = ()
-    """What the graph left out, and why."""
+    """What the graph left out, and why: :class:`rtgs.core.decisions.Decision` as pairs, the form that older recipes
+    have, so that their reports are found."""
     views: int = 4
     """How many test views are shown: the best, the worst, and evenly between."""
 
@@ -44,7 +47,7 @@ class ReportParams:
 def report(params: ReportParams, context: StepContext) -> None:
     """Write ``report.html``."""
     from rtgs.evaluate.records import read_json
-    from rtgs.report.page import ConfigLine, Decision, ReportData, write_report
+    from rtgs.report.page import ConfigLine, ReportData, write_report
 
     inputs = context.inputs
     table = read_json(inputs["evaluate"] / TABLE_JSON)
@@ -54,8 +57,9 @@ def report(params: ReportParams, context: StepContext) -> None:
     assert manifest is not None
     decisions = [Decision(*item) for item in params.decisions]
     decisions += _prepared(inputs)
-    decisions += [Decision(**item) for item in summary["decisions"]]  # pyright: ignore[reportGeneralTypeIssues]
-    decisions += _mesh_decisions(inputs)
+    decisions += summary.decisions
+    mesh = MeshRecord.read(inputs["extract_mesh"]) if "extract_mesh" in inputs else None
+    decisions += () if mesh is None else mesh.decisions  # how the transparent object's mesh was chosen
     decisions += _boundary(training)
     decisions += _guide(table)
     data = ReportData(
@@ -63,13 +67,14 @@ def report(params: ReportParams, context: StepContext) -> None:
         evaluation=table,
         command=params.command,
         created=datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
-        views=_views(table, inputs, params.views),
+        views=_views(table, context, params.views),
         curves=_curves(inputs),
         steps=_steps(context),
         decisions=tuple(decisions),
         config=tuple(ConfigLine(key, *both) for key, both in sorted(params.config.items())),
         machine={key: str(value) for key, value in (manifest.machine | manifest.versions).items()},
-        mesh=_mesh(inputs["extract_mesh"]) if "extract_mesh" in inputs else None,
+        mesh=None if mesh is None else _mesh(inputs["extract_mesh"], mesh),
+        timed="per view, maps included" if RenderTimes.read(inputs["render"]).with_maps else "per view",
     )
     size = write_report(context.out / PAGE, data)
     context.log.info("report of %.1f MB", size / 1e6)
@@ -82,7 +87,6 @@ def _prepared(inputs: Mapping[str, Path]) -> list[Decision]:
     from rtgs.prepare.masks.report import MaskReport
     from rtgs.prepare.normals.make import read_message
     from rtgs.prepare.poses.quality import SfmReport
-    from rtgs.report.page import Decision
     from rtgs.scenes.capture import list_some
 
     lines = []
@@ -98,15 +102,15 @@ def _prepared(inputs: Mapping[str, Path]) -> list[Decision]:
     return lines
 
 
-def _views(table: EvaluationTable, inputs: Mapping[str, Path], count: int) -> tuple[ReportView, ...]:
+def _views(table: EvaluationTable, context: StepContext, count: int) -> tuple[ReportView, ...]:
     from rtgs.report.page import ReportView, pick_views
     from rtgs.scenes.canonical import read_scene
 
-    photos = {view.name: view for view in read_scene(inputs["import_scene"]).test}
+    photos = {view.name: view for view in context.read("import_scene", read_scene).test}
     views = []
     for row, role in pick_views(table, count):
         name = table.rows[row].view
-        maps = read_render(inputs["render"], name)
+        maps = read_render(context.inputs["render"], name)
         photo = photos[name]
         shown = {key: maps.get(key) for key in ("depth", "normal", "alpha")}
         seen = (name, photo.camera, photo.image, maps["image"], role)
@@ -124,22 +128,16 @@ def _layers(maps: dict[str, Tensor]) -> dict[str, Tensor]:
 
 def _boundary(training: Path) -> list[Decision]:
     """How well the transparent object's surface is known, where a third stage has written it down."""
-    from rtgs.evaluate.boundary import BoundaryScores
-    from rtgs.report.page import Decision
+    from rtgs.evaluate.boundary import BoundaryRecord
 
-    path = training / BOUNDARY_FILE
-    if not path.is_file():
+    scores = BoundaryRecord.read(training)
+    if scores is None:
         return []
-    scores = json.loads(path.read_text(encoding="utf-8"))
-    return [
-        Decision(f"object's surface {when} the third stage", str(BoundaryScores(**scores[when]))) for when in scores
-    ]
+    return [Decision(f"object's surface {when} the third stage", str(each)) for when, each in vars(scores).items()]
 
 
 def _guide(table: EvaluationTable) -> list[Decision]:
     """Where the object's mesh gives no pair of surfaces, and how far it is from the true container."""
-    from rtgs.report.page import Decision
-
     known = table.object
     if known is None:
         return []
@@ -153,29 +151,20 @@ def _guide(table: EvaluationTable) -> list[Decision]:
     return lines
 
 
-def _mesh_decisions(inputs: Mapping[str, Path]) -> list[Decision]:
-    """How the transparent object's mesh was chosen."""
-    from rtgs.report.page import Decision
-
-    if "extract_mesh" not in inputs:
-        return []
-    record = json.loads((inputs["extract_mesh"] / extract_mesh.SUMMARY_FILE).read_text(encoding="utf-8"))
-    return [Decision(what, why) for what, why in record.get("decisions", [])]
-
-
-def _mesh(folder: Path) -> MeshFigure | None:
+def _mesh(folder: Path, record: MeshRecord) -> MeshFigure | None:
     """None: the scene turned out to have no transparent object."""
     import numpy as np
     from PIL import Image
 
     from rtgs.report.page import MeshFigure
 
-    if extract_mesh.why_absent(folder):
+    if record.absent:
         return None
-    record = json.loads((folder / extract_mesh.SUMMARY_FILE).read_text(encoding="utf-8"))
+    if record.vertices is None or record.faces is None:
+        raise damaged(folder / RECORD_FILE, "the counts of vertices and faces are missing")
     pixels = np.asarray(Image.open(folder / extract_mesh.PICTURE_FILE).convert("RGB"))
-    note = f"{record['note']} Seen from {record['picture_from']}."
-    return MeshFigure(pixels, record["vertices"], record["faces"], note)
+    note = f"{record.note} Seen from {record.picture_from}."
+    return MeshFigure(pixels, record.vertices, record.faces, note)
 
 
 def _curves(inputs: Mapping[str, Path]) -> tuple[Curve, ...]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import json
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +17,6 @@ from rtgs.workflow.fingerprint import file_digest
 if TYPE_CHECKING:
     from rtgs.evaluate.boundary import BoundaryScores
 
-BOUNDARY_FILE = "boundary.json"
 MESH_STEP = "extract_mesh"
 
 
@@ -44,20 +42,19 @@ def train(params: StageParams, context: StepContext) -> None:
 
 
 def _train_with_object(params: StageParams, context: StepContext) -> None:
-    from rtgs.evaluate.boundary import boundary_scores
+    from rtgs.evaluate.boundary import BoundaryRecord, boundary_scores
     from rtgs.mesh.container import read_object_mesh
     from rtgs.scenes.canonical import read_scene
 
-    scene = read_scene(context.inputs["import_scene"])
+    scene = context.read("import_scene", read_scene)
     mesh = read_object_mesh(context.inputs[MESH_STEP])
     before, stage = load_method(last_training(context.inputs), scene)
-    scores = {"before": boundary_scores(before, scene, mesh, stage.until)}
+    at_start = boundary_scores(before, scene, mesh, stage.until)
     del before
     method = train_stage(params, context, mesh)
-    scores["after"] = boundary_scores(method, scene, mesh, params.until)
-    text = json.dumps({when: vars(values) for when, values in scores.items()}, indent=1)
-    (context.out / BOUNDARY_FILE).write_text(text + "\n", encoding="utf-8")
-    for when, values in scores.items():
+    record = BoundaryRecord(at_start, boundary_scores(method, scene, mesh, params.until))
+    record.write(context.out)
+    for when, values in vars(record).items():
         context.log.info("%s the %s stage: %s", when, params.stage, values)
         context.tracker.metrics(_numbers(values, when))
 

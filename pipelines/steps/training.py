@@ -6,12 +6,13 @@ import json
 import math
 import shutil
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rtgs.core.build import build
 from rtgs.core.errors import RtgsError
+from rtgs.core.records import read_json, record_of, write_json
 from rtgs.methods.settings import MethodSettings
 from rtgs.track import Tracker
 from rtgs.train.settings import ScheduleSettings
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from rtgs.mesh.container import ObjectMesh
     from rtgs.methods.model import Model
     from rtgs.scenes.scene import Scene
+    from rtgs.train.trainer import TrainSummary
 
 CHECKPOINT_FOLDER = "checkpoint"
 SUMMARY_FILE = "summary.json"
@@ -60,7 +62,7 @@ def train_stage(params: StageParams, context: StepContext, object_mesh: ObjectMe
     from rtgs.train.seeds import generator_for
     from rtgs.train.trainer import Trainer
 
-    scene = read_scene(context.inputs["import_scene"])
+    scene = context.read("import_scene", read_scene)
     generator = generator_for(params.seed, "initialise")
     method = create_method(params.method, scene, params.schedule, generator, object_mesh)
     stage = Stage(params.stage, params.from_step, params.until)
@@ -72,7 +74,7 @@ def train_stage(params: StageParams, context: StepContext, object_mesh: ObjectMe
         scene,
         seed=params.seed,
         stage=stage,
-        progress=progress_for(),
+        progress=progress_for(quiet=context.quiet),
         recorder=recorder,
         checkpoint_dir=checkpoints,
         observer=TrainingPictures(scene, context.partial / FOLDER, params.schedule.total),
@@ -86,7 +88,7 @@ def train_stage(params: StageParams, context: StepContext, object_mesh: ObjectMe
     for part in method.sets:
         write_ply(context.out / f"{part.name}.ply", part.gaussians)
     record = {key: _finite(value) for key, value in asdict(summary).items()}
-    (context.out / SUMMARY_FILE).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    write_json(context.out / SUMMARY_FILE, record)
     recorder.write_history(context.out / HISTORY_FILE)
     if (context.partial / FOLDER).is_dir():
         shutil.copytree(context.partial / FOLDER, context.out / FOLDER)
@@ -144,9 +146,20 @@ def read_history(folder: Path) -> list[dict[str, float]]:
     return [{key: value for key, value in json.loads(line).items() if value is not None} for line in lines]
 
 
-def read_summary(folder: Path) -> dict[str, object]:
-    """``summary.json`` of a training artifact (fields of :class:`rtgs.train.trainer.TrainSummary`)."""
-    return json.loads((folder / SUMMARY_FILE).read_text(encoding="utf-8"))
+def read_summary(folder: Path) -> TrainSummary:
+    """``summary.json`` of a training artifact.
+
+    Raises:
+        RtgsError: it is missing or damaged.
+    """
+    from rtgs.train.trainer import TrainSummary
+
+    path = folder / SUMMARY_FILE
+    values = read_json(path)
+    for item in fields(TrainSummary):
+        if item.type == "float" and values.get(item.name, 0.0) is None:  # JSON has no NaN and no infinity
+            values[item.name] = math.nan
+    return record_of(TrainSummary, values, path)
 
 
 def stage_params(folder: Path) -> StageParams:

@@ -1,4 +1,7 @@
-"""What settings refuse, in one wording: the key, the value, what is legal."""
+"""What settings refuse, in one wording: the key, the value, what is legal.
+
+Every function raises :class:`rtgs.core.errors.RtgsError`. ``key`` is the dotted key of the config that a user sets.
+"""
 
 from __future__ import annotations
 
@@ -13,21 +16,38 @@ from rtgs.core.errors import RtgsError
 
 
 def refuse_bad_numbers(settings: object, where: str) -> None:
-    """Every float of a settings object must be finite and not negative, every ``*_start`` a share."""
+    """Every float of a settings object must be finite and not negative, every ``*_start`` a share.
+
+    Raises:
+        RtgsError: names the first field that is neither; ``where`` is the key of the settings object.
+    """
     for entry in fields(settings):  # type: ignore[arg-type]
         value = getattr(settings, entry.name)
         if not isinstance(value, float):
             continue
         largest = 1.0 if entry.name.endswith("_start") else math.inf
-        if not (0 <= value <= largest and math.isfinite(value)):
-            allowed = "between 0 and 1" if largest == 1 else "a finite number of at least 0"
-            raise ValueError(f"{where}.{entry.name}={value} must be {allowed}")
+        allowed = "between 0 and 1" if largest == 1 else "a finite number of at least 0"
+        refuse_unless(0 <= value <= largest and math.isfinite(value), f"{where}.{entry.name}", value, allowed)
 
 
 def refuse_unless(legal: bool, key: str, value: object, allowed: str) -> None:
-    """Raise ValueError naming the key unless its value is legal."""
+    """Refuse a value that is not ``legal``; ``allowed`` completes "must be ...".
+
+    Raises:
+        RtgsError: ``<key>=<value> must be <allowed>``.
+    """
     if not legal:
-        raise ValueError(f"{key}={value} must be {allowed}")
+        raise RtgsError(f"{key}={value} must be {allowed}")
+
+
+def refuse_below(key: str, value: float | None, least: float) -> None:
+    """Refuse a number below ``least``, NaN and infinity; None is "not set" and legal.
+
+    Raises:
+        RtgsError: ``<key>=<value> must be at least <least>``.
+    """
+    if value is not None:
+        refuse_unless(math.isfinite(value) and value >= least, key, value, f"at least {least:g}")
 
 
 def refuse_unknown_words(settings: object, where: str) -> None:
@@ -40,18 +60,19 @@ def refuse_unknown_words(settings: object, where: str) -> None:
         refuse_unknown(f"{where}.{name}", getattr(settings, name), hint)
 
 
-def refuse_unknown(key: str, value: object, hint: object) -> None:
-    """Refuse a value that is none of the words of ``hint``; a hint that is no ``Literal`` allows everything.
+def refuse_unknown(key: str, value: object, known: object) -> None:
+    """Refuse a value that is none of the ``known`` words: a tuple of them, or a ``Literal``; another annotation allows
+    everything.
 
     Raises:
-        RtgsError: names the key, the value, the words, and the nearest of them.
+        RtgsError: names the key, the value, the words, and the one that was probably meant.
     """
-    known = words_of(hint)
-    if not known or value in known or (value is None and type(None) in typing.get_args(hint)):
+    words = known if isinstance(known, tuple) else words_of(known)
+    if not words or value in words or (value is None and type(None) in typing.get_args(known)):
         return
-    close = difflib.get_close_matches(str(value), [str(word) for word in known], n=1)
+    close = difflib.get_close_matches(str(value), [str(word) for word in words], n=1)
     advice = f"; did you mean {close[0]!r}?" if close else ""
-    raise RtgsError(f"{key}={value!r} is unknown: choose one of {', '.join(map(str, known))}{advice}")
+    raise RtgsError(f"{key}={value!r} is unknown: choose one of {', '.join(map(str, words))}{advice}")
 
 
 def words_of(hint: object) -> tuple[str | int, ...]:

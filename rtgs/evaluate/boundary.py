@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from rtgs.core.records import read_record, write_json
 from rtgs.evaluate.surface import DEPTH_TOLERANCE, NORMAL_TOLERANCE, surface_errors
 from rtgs.mesh.container import ObjectGuide, ObjectMesh
 from rtgs.mesh.silhouettes import bounding
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
     from rtgs.scenes.scene import Scene, View
     from rtgs.train.method import Method
 
+BOUNDARY_FILE = "boundary.json"
 RENDERED_VIEWS = 12  # about so many training views are rendered for their k_s
 
 
@@ -43,6 +46,28 @@ class BoundaryScores:
             "mean k_s": self.specular,
         }
         return ", ".join(f"{name} {value:.3g}" for name, value in words.items() if value is not None)
+
+
+@dataclass(frozen=True)
+class BoundaryRecord:
+    """``boundary.json`` of a training artifact: the scores where the third stage begins, and where it ends."""
+
+    before: BoundaryScores
+    after: BoundaryScores
+
+    def write(self, folder: Path) -> None:
+        """Write ``folder/boundary.json``."""
+        write_json(folder / BOUNDARY_FILE, asdict(self))
+
+    @staticmethod
+    def read(folder: Path) -> BoundaryRecord | None:
+        """Read ``folder/boundary.json``; None: there is none, as after a training without a third stage.
+
+        Raises:
+            RtgsError: it is damaged.
+        """
+        path = folder / BOUNDARY_FILE
+        return read_record(BoundaryRecord, path) if path.is_file() else None
 
 
 def boundary_scores(method: Method, scene: Scene, mesh: ObjectMesh, step: int) -> BoundaryScores:

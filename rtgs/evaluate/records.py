@@ -5,8 +5,11 @@ from __future__ import annotations
 import csv
 import json
 import math
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
+
+from rtgs.core import records
+from rtgs.core.errors import RtgsError
 
 FORMAT = "rtgs-evaluation"
 VERSION = 4  # 2: the layer metrics; 3: transmission, given masks; 4: the surface in the mask, the object's mesh
@@ -34,7 +37,7 @@ METRICS = (
     "psnr_8bit",
     "ssim_8bit",
     "lpips_01_8bit",
-    "render_seconds",
+    "render_seconds",  # of the image with the maps that the run keeps of it; artifacts of older versions: of the image
 )
 
 
@@ -161,20 +164,15 @@ def read_json(path: Path) -> EvaluationTable:
     """Read what :func:`write_json` wrote.
 
     Raises:
-        ValueError: another file, or one of another version.
+        RtgsError: another file, one of another version, or a damaged one; names it and what to do.
     """
-    document = json.loads(path.read_text(encoding="utf-8"))
-    found = (document.get("format"), document.get("version")) if isinstance(document, dict) else (None, None)
+    document = records.read_json(path)
+    found = (document.get("format"), document.get("version"))
     if found != (FORMAT, VERSION):
-        raise ValueError(f"{path} is not an evaluation: format {found}, expected {(FORMAT, VERSION)}")
-    return EvaluationTable(
-        RunFacts(**document["facts"]),
-        tuple(ViewScore(**row) for row in document["views"]),
-        document["missing"],
-        document["reflection_scale"],
-        document["transmission_scale"],
-        None if document["object"] is None else ObjectFacts(**document["object"]),
-    )
+        raise RtgsError(f"{path} is not an evaluation: format {found}, expected {(FORMAT, VERSION)}")
+    names = {item.name for item in fields(EvaluationTable)} - {"rows"}
+    values = {name: document[name] for name in names & document.keys()} | {"rows": document.get("views")}
+    return records.record_of(EvaluationTable, values, path)
 
 
 def write_csv(path: Path, table: EvaluationTable) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rtgs.core.decisions import Decision
 from rtgs.core.errors import RtgsError
 from rtgs.core.refuse import refuse_unknown
 from rtgs.mesh.container import ObjectMesh
@@ -35,7 +36,7 @@ class Choice:
     iou: SilhouetteScore  # with the masks, where nothing opaque hides the object
     iou_all: SilhouetteScore  # with the masks as they are
     candidates: dict[str, float]  # mean IoU of every mesh that was made
-    decisions: tuple[tuple[str, str], ...]  # (what, why)
+    decisions: tuple[Decision, ...]
     hull: HullResult | None
 
 
@@ -46,7 +47,7 @@ class _Candidates:
         self, masks: MaskSet, settings: ObjectSettings, fuse: Fusion, panes: Sequence[np.ndarray] = ()
     ) -> None:
         self.masks, self.settings, self.fuse, self.panes = masks, settings, fuse, panes
-        self.decisions: list[tuple[str, str]] = []
+        self.decisions: list[Decision] = []
         self.hull: HullResult | None = None
         self.scores: dict[str, float] = {}
 
@@ -60,7 +61,7 @@ class _Candidates:
         self.scores["hull"] = self.score(hull.mesh).mean
         if hull.note:
             done = f"hull trimmed to what {hull.trim_views} views see" if hull.trim_views else "hull not trimmed"
-            self.decisions.append((done, hull.note))
+            self.decisions.append(Decision(done, hull.note))
         return ObjectMesh(hull.mesh, "hull", hull.voxel, flat=False)
 
     def drawn(self) -> ObjectMesh | None:
@@ -70,7 +71,7 @@ class _Candidates:
         try:
             pane = drawn_pane(self.panes, self.masks.views)
         except RtgsError as error:
-            self.decisions.append(("drawn panes not taken", str(error)))
+            self.decisions.append(Decision("drawn panes not taken", str(error)))
             return None
         self.scores["drawn panes"] = score = self.score(pane.mesh).mean
         if score >= self.settings.pane.agree:
@@ -78,7 +79,7 @@ class _Candidates:
         why = (
             f"their silhouette IoU with the masks is {score:.3f} (mesh.object.pane.agree {self.settings.pane.agree:g})"
         )
-        self.decisions.append(("drawn panes not taken", why))
+        self.decisions.append(Decision("drawn panes not taken", why))
         return None
 
     def pane(self) -> ObjectMesh:
@@ -117,7 +118,7 @@ class _Candidates:
         found = ObjectMesh(mesh, "given", side / self.settings.hull.voxels, flat=self._flat(mesh))
         if not found.closed or volume(mesh) >= 0:
             return found
-        self.decisions.append(("given mesh turned inside out", "its triangles face inward"))
+        self.decisions.append(Decision("given mesh turned inside out", "its triangles face inward"))
         return replace(found, mesh=replace(mesh, faces=mesh.faces[:, ::-1]))
 
     def _flat(self, mesh: TriangleMesh) -> bool:
@@ -155,7 +156,7 @@ def choose_object_mesh(
     about += "".join(f", {text}" for text, count in zip(left, (masks.without, masks.empty, masks.full)) if count)
     scores = ", ".join(f"{name} {value:.3f}" for name, value in tried.scores.items())
     what = f"object mesh: {'a flat pane' if mesh.flat else mesh.source}"
-    tried.decisions.insert(0, (what, f"mesh.source is {source}; silhouette IoU: {scores}; {about}"))
+    tried.decisions.insert(0, Decision(what, f"mesh.source is {source}; silhouette IoU: {scores}; {about}"))
     score, plain = tried.score(mesh.mesh), silhouette_score(mesh.mesh, masks.views)
     return Choice(mesh, score, plain, tried.scores, tuple(tried.decisions), tried.hull)
 
@@ -176,7 +177,7 @@ def _hull_or_pane(tried: _Candidates) -> ObjectMesh:
     except RtgsError as error:
         if flat == "no":
             raise
-        tried.decisions.append(("no hull", str(error)))
+        tried.decisions.append(Decision("no hull", str(error)))
         hull = None
     if flat == "no" and hull is not None:
         return hull
@@ -186,7 +187,7 @@ def _hull_or_pane(tried: _Candidates) -> ObjectMesh:
         if tried.scores["pane"] >= needed:
             return found
     if hull is None:
-        raise RtgsError(f"neither a hull nor a pane explains the masks: {tried.decisions[-1][1]}")
+        raise RtgsError(f"neither a hull nor a pane explains the masks: {tried.decisions[-1].why}")
     return hull
 
 
@@ -203,12 +204,13 @@ def _automatic(tried: _Candidates) -> ObjectMesh:
     try:
         first = _hull_or_pane(tried)
     except RtgsError as error:
-        tried.decisions.append(("no hull", str(error)))
+        tried.decisions.append(Decision("no hull", str(error)))
     if first is not None and first.flat:
         return first
     if first is not None and not trusted:
         why = f"{len(masks.views)} masks (mesh.object.hull.min_views {hull.min_views}) from directions {spread:.0f} "
-        tried.decisions.append(("hull not chosen", f"{why}degrees apart at most (min_spread {hull.min_spread:g})"))
+        why += f"degrees apart at most (min_spread {hull.min_spread:g})"
+        tried.decisions.append(Decision("hull not chosen", why))
     elif first is not None and tried.scores["hull"] >= tried.settings.accept:
         return first
     try:
@@ -216,9 +218,10 @@ def _automatic(tried: _Candidates) -> ObjectMesh:
         if (score := tried.scores["tsdf"]) < (least := tried.settings.tsdf_accept):
             raise RtgsError(f"its silhouette IoU with the masks is {score:.3f} (mesh.object.tsdf_accept {least:g})")
     except RtgsError as error:
-        tried.decisions.append(("no TSDF mesh", str(error)))
+        tried.decisions.append(Decision("no TSDF mesh", str(error)))
         if first is None:
-            reasons = "; ".join(f"{what}: {why}" for what, why in dict(tried.decisions).items())
+            last = {decision.what: decision for decision in tried.decisions}  # of each kind
+            reasons = "; ".join(map(str, last.values()))
             raise RtgsError(f"no mesh of the transparent object can be made ({reasons}): {_REMEDY}") from error
         return first
     better = first is None or not trusted or score > tried.scores["hull"]
@@ -238,8 +241,3 @@ def read_given(path: str) -> TriangleMesh:
     if file.suffix.lower() not in readers:
         raise RtgsError(f"mesh.object.given is {path}: only .ply and .obj are read")
     return readers[file.suffix.lower()](file)
-
-
-def names(decisions: Sequence[tuple[str, str]]) -> str:
-    """The decisions on one line."""
-    return "; ".join(f"{what}: {why}" for what, why in decisions)

@@ -3,9 +3,8 @@ rays enter and leave it, its normals, the box its contents live in."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -15,12 +14,13 @@ from torch import Tensor
 
 from rtgs.core.cameras import Camera
 from rtgs.core.errors import RtgsError
+from rtgs.core.records import damaged
 from rtgs.mesh.guide import MeshGuide
 from rtgs.mesh.normals import corner_normals, interpolated, neighbourhood_normals
+from rtgs.mesh.record import RECORD_FILE, MeshRecord
 from rtgs.mesh.triangles import TriangleMesh, read_mesh_ply, write_mesh_ply
 
 MESH_FILE = "mesh.ply"
-RECORD_FILE = "mesh.json"
 SOURCES = ("hull", "tsdf", "given")
 MERGE_VOXELS = 2.0  # crossings nearer than this are one wall (method.md 6.3)
 BOX_MARGIN = 0.05  # of the object box, on each side (method.md 6.2)
@@ -186,13 +186,12 @@ def _directions(count: int) -> np.ndarray:
     return np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1)
 
 
-def write_object_mesh(folder: Path, mesh: ObjectMesh, record: Mapping[str, object] | None = None) -> None:
+def write_object_mesh(folder: Path, mesh: ObjectMesh, record: MeshRecord | None = None) -> None:
     """Write ``mesh.ply`` and ``mesh.json`` (source, voxel, flat, counts, and what ``record`` adds) into ``folder``."""
     write_mesh_ply(folder / MESH_FILE, mesh.mesh)
-    own = {"source": mesh.source, "voxel": mesh.voxel, "flat": mesh.flat}
-    counts = {"vertices": len(mesh.mesh.vertices), "faces": len(mesh.mesh.faces)}
-    text = json.dumps(dict(record or {}) | own | counts, indent=1)
-    (folder / RECORD_FILE).write_text(text + "\n", encoding="utf-8")
+    vertices, faces = len(mesh.mesh.vertices), len(mesh.mesh.faces)
+    own = {"source": mesh.source, "voxel": mesh.voxel, "flat": mesh.flat, "vertices": vertices, "faces": faces}
+    replace(record or MeshRecord(), **own).write(folder)
 
 
 def read_object_mesh(folder: Path) -> ObjectMesh:
@@ -201,13 +200,10 @@ def read_object_mesh(folder: Path) -> ObjectMesh:
     Raises:
         RtgsError: a file is missing or damaged, or the mesh is empty.
     """
-    path = folder / RECORD_FILE
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-        source, voxel, flat = str(record["source"]), float(record["voxel"]), bool(record["flat"])
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        raise RtgsError(f"{path} is no description of an object mesh ({error!r}): run extract_mesh again") from error
-    return ObjectMesh(read_mesh_ply(folder / MESH_FILE), source, voxel, flat)
+    record = MeshRecord.read(folder)
+    if record.source is None or record.voxel is None or record.flat is None:
+        raise damaged(folder / RECORD_FILE, "it describes no object mesh: source, voxel or flat is missing")
+    return ObjectMesh(read_mesh_ply(folder / MESH_FILE), record.source, record.voxel, record.flat)
 
 
 @dataclass(frozen=True)

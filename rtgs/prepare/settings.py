@@ -8,8 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from rtgs.core.refuse import refuse_unknown_words
-from rtgs.prepare.errors import PrepareError
+from rtgs.core.errors import RtgsError
+from rtgs.core.refuse import refuse_below, refuse_unknown_words, refuse_unless
 from rtgs.prepare.normals.adapters import ADAPTERS, NormalAdapter, NormalNetwork
 
 Use = Literal["auto", "always", "never"]
@@ -140,7 +140,7 @@ class SfmSettings:
     """Poses from photos or a video.
 
     Raises:
-        PrepareError: a value outside its documented range.
+        RtgsError: a value outside its documented range.
     """
 
     use: Use = "auto"
@@ -179,10 +179,9 @@ class SfmSettings:
             ("min_photos", self.min_photos, 2),
             ("video.max_frames", self.video.max_frames, 3),
         ):
-            if not value >= least:
-                raise PrepareError(f"setting sfm.{key}={value}: must be at least {least}")
-        if not 0 < self.video.shift < 1:
-            raise PrepareError(f"setting sfm.video.shift={self.video.shift}: must lie between 0 and 1 (long sides)")
+            refuse_below(f"sfm.{key}", value, least)
+        shift = self.video.shift
+        refuse_unless(0 < shift < 1, "sfm.video.shift", shift, "between 0 and 1 (long sides)")
 
 
 @dataclass(frozen=True)
@@ -190,7 +189,7 @@ class NormalSettings:
     """Monocular normals for photos that have none.
 
     Raises:
-        PrepareError: a value outside its documented range.
+        RtgsError: a value outside its documented range.
     """
 
     use: Use = "auto"
@@ -222,13 +221,11 @@ class NormalSettings:
         object.__setattr__(self, "axes", tuple(self.axes))
         refuse_unknown_words(self, "normals")
         if self.model == "custom" and not self.file:
-            raise PrepareError("setting normals.model=custom needs normals.file, the ONNX file")
-        if not self.max_side >= 32:
-            raise PrepareError(f"setting normals.max_side={self.max_side}: must be at least 32")
-        if self.tile and not self.tile >= 64:
-            raise PrepareError(f"setting normals.tile={self.tile}: give 0 (no tiles) or at least 64 pixels")
-        if not 0 <= self.tile_overlap <= 0.5:
-            raise PrepareError(f"setting normals.tile_overlap={self.tile_overlap}: must lie between 0 and 0.5")
+            raise RtgsError("normals.model=custom needs normals.file, the ONNX file")
+        refuse_below("normals.max_side", self.max_side, 32)
+        tile, overlap = self.tile, self.tile_overlap
+        refuse_unless(tile == 0 or tile >= 64, "normals.tile", tile, "0 (no tiles) or at least 64 pixels")
+        refuse_unless(0 <= overlap <= 0.5, "normals.tile_overlap", overlap, "between 0 and 0.5")
 
     @property
     def declared(self) -> NormalAdapter:

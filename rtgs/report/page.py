@@ -13,6 +13,7 @@ import numpy as np
 from torch import Tensor
 
 from rtgs.core.cameras import Camera
+from rtgs.core.decisions import Decision
 from rtgs.evaluate.images import ERROR_COLORMAP, ERROR_FULL_SCALE, error_map, to_bytes
 from rtgs.evaluate.records import EvaluationTable, ViewScore
 from rtgs.report.figures import (
@@ -46,14 +47,6 @@ class StepLine:
     hit: bool  # read from the cache instead of run
     seconds: float | None = None  # of the execution that made the artifact
     reason: str = ""  # why it had to run
-
-
-@dataclass(frozen=True)
-class Decision:
-    """Something the recipe could do and did not, or did differently, and why."""
-
-    what: str
-    why: str
 
 
 @dataclass(frozen=True)
@@ -111,6 +104,7 @@ class ReportData:
     config: tuple[ConfigLine, ...] = ()
     machine: Mapping[str, str] = field(default_factory=dict)  # processor, cores, threads, instruction set, versions
     mesh: MeshFigure | None = None
+    timed: str = "per view"  # what the time of rendering is of
 
 
 @dataclass(frozen=True)

@@ -8,26 +8,25 @@ from collections.abc import Iterable
 from functools import lru_cache
 from pathlib import Path
 
-from rtgs.scenes.capture import raise_errors
+from rtgs.scenes.capture import Capture, raise_errors
 from rtgs.scenes.findings import missing_files
 from rtgs.scenes.importers.registry import read_capture
-from rtgs.scenes.once import remembered
 from rtgs.scenes.settings import CaptureError, SceneSettings
 from rtgs.scenes.splits import select_views
 from rtgs.scenes.truth_files import truth_files
 
 
-@remembered
-def capture_digest(settings: SceneSettings) -> str:
+def capture_digest(settings: SceneSettings, capture: Capture | None = None) -> str:
     """SHA-256 over names (relative to the capture), sizes and contents of all files an import of ``settings`` reads.
 
     Files a capture holds but the import does not use (photos without a pose, views beyond ``max_views``) do not count,
-    nor does the place of the capture. The settings themselves are not part of it.
+    nor does the place of the capture. The settings themselves are not part of it. ``capture``: what these settings
+    read, where the caller has it already.
 
     Raises:
         CaptureError: the capture cannot be read or files of it are missing.
     """
-    capture = read_capture(settings)
+    capture = read_capture(settings) if capture is None else capture
     raise_errors(missing_files(capture), capture.root)
     files = set(capture.model_files)
     for view in select_views(capture, settings):

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Literal
 
-from rtgs.core.refuse import refuse_unknown_words
+from rtgs.core.errors import RtgsError
+from rtgs.core.refuse import refuse_below, refuse_unknown_words, refuse_unless
 
 CaptureFormat = Literal["auto", "colmap", "transforms", "blender"]
 NormalFrame = Literal["opencv", "opengl"]
 
 
-class CaptureError(ValueError):
+class CaptureError(RtgsError):
     """A capture that cannot be read. The message says what is wrong, where, and what to do about it."""
 
 
@@ -21,8 +21,7 @@ class SceneSettings:
     """Import settings of one capture. Every relative path is relative to ``path``.
 
     Raises:
-        CaptureError: a value outside its documented range (a negative size).
-        RtgsError: a word that is none of those to choose from (a misspelt format).
+        RtgsError: a value outside its documented range (a misspelt format, a negative size).
     """
 
     name: str = "scene"
@@ -82,17 +81,12 @@ class SceneSettings:
     def __post_init__(self) -> None:
         object.__setattr__(self, "background", tuple(float(c) for c in self.background))
         refuse_unknown_words(self, "scene")
-        if len(self.background) != 3 or not all(0 <= c <= 1 for c in self.background):
-            raise CaptureError(f"scene setting background={self.background}: give three numbers between 0 and 1")
-        if self.resize_ratio is not None and not 0 < self.resize_ratio <= 1:
-            raise CaptureError(f"scene setting resize_ratio={self.resize_ratio}: must lie in (0, 1]")
-        for field_name, least in (("long_side", 1), ("max_views", 1), ("max_point_error", 0), ("random_box", 0)):
-            _check_least(field_name, getattr(self, field_name), least)
-        for field_name in ("split_every", "min_points", "min_track_length", "near_camera", "far_factor"):
-            _check_least(field_name, getattr(self, field_name), 0)
-        _check_least("random_points", self.random_points, 1)
-
-
-def _check_least(field_name: str, value: float | None, least: float) -> None:
-    if value is not None and not (math.isfinite(value) and value >= least):
-        raise CaptureError(f"scene setting {field_name}={value}: must be at least {least}")
+        colour = len(self.background) == 3 and all(0 <= c <= 1 for c in self.background)
+        refuse_unless(colour, "scene.background", self.background, "three numbers between 0 and 1")
+        ratio = self.resize_ratio
+        refuse_unless(ratio is None or 0 < ratio <= 1, "scene.resize_ratio", ratio, "in (0, 1]")
+        for key, least in (("long_side", 1), ("max_views", 1), ("max_point_error", 0), ("random_box", 0)):
+            refuse_below(f"scene.{key}", getattr(self, key), least)
+        for key in ("split_every", "min_points", "min_track_length", "near_camera", "far_factor"):
+            refuse_below(f"scene.{key}", getattr(self, key), 0)
+        refuse_below("scene.random_points", self.random_points, 1)

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import sys
 import time
 from dataclasses import dataclass
 from typing import Protocol, TextIO
-
-WORKER = "RTGS_WORKER"
-"""Environment variable of processes whose steps belong to a plan that another process shows."""
 
 
 @dataclass(frozen=True)
@@ -121,15 +117,15 @@ class BarProgress:
         self._bar.stop()
 
 
-def progress_for(stream: TextIO | None = None) -> Progress:
+def progress_for(stream: TextIO | None = None, *, quiet: bool = False) -> Progress:
     """A bar where ``stream`` (default: standard error) is a terminal, lines elsewhere.
 
-    Nothing on the terminal of a worker (:data:`WORKER`): the display of the whole plan is there, and two would fight.
+    ``quiet``: nothing on a terminal. Another process draws the display of the whole plan there, and two would fight.
     """
     shown: TextIO = stream or sys.stderr
     if not shown.isatty():
         return LineProgress(shown)
-    return SilentProgress() if os.environ.get(WORKER) else BarProgress(shown)
+    return SilentProgress() if quiet else BarProgress(shown)
 
 
 def _clock(seconds: float) -> str:

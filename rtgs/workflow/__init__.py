@@ -1,6 +1,7 @@
 """Cached pipeline steps: a pure graph of recipes, a content-addressed store, a plan, and an executor."""
 
 from rtgs.core.recipe import NOT_IN_RECIPE
+from rtgs.workflow.artifacts import Artifacts
 from rtgs.workflow.executors import Executor, InlineExecutor, StepResult
 from rtgs.workflow.outcome import StepOutcome, StepUnfinished, SweepOutcomes
 from rtgs.workflow.plan import Plan, PlannedStep, make_plan, topological
@@ -11,6 +12,7 @@ from rtgs.workflow.store import Artifact, Store
 __all__ = [
     "NOT_IN_RECIPE",
     "Artifact",
+    "Artifacts",
     "Executor",
     "InlineExecutor",
     "Plan",

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("rtgs.workflow")
 EngineKind = Literal["local", "ssh", "slurm", "address"]
-WORKER = "RTGS_WORKER"  # what rtgs.train.progress asks for
 
 
 @dataclass(frozen=True)
@@ -132,7 +131,8 @@ def run_step(step: Step, job: WorkerJob, before: list[StepOutcome]) -> StepOutco
 
     torch.set_num_threads(job.threads)
     tracking = open_tracking(job.tracking, Path(job.tracking_root), job.tracking_uri)
-    executor = InlineExecutor(Store(Path(job.store)), tracking, RemoteStore(job.remote) if job.remote else None)
+    remote = RemoteStore(job.remote) if job.remote else None
+    executor = InlineExecutor(Store(Path(job.store)), tracking, remote, quiet=True)
     if not any(outcome.failed for outcome in before):
         for other in step.upstream:  # on a machine without the shared disk it comes from the remote store
             executor.outcome(other, "", ())
@@ -163,7 +163,7 @@ def open_client(settings: EngineSettings) -> Iterator[Client]:
     except ImportError as error:
         raise RtgsError("hydra/launcher=rtgs_dask needs Dask: pip install 'rtgs[cluster]'") from error
     logging.getLogger("distributed").setLevel(logging.WARNING)  # importing it sets INFO, over what conf/hydra says
-    at_start = {key: value for key, value in worker_environment(settings.worker_threads).items() if key != WORKER}
+    at_start = worker_environment(settings.worker_threads)
     limits = {
         "distributed.scheduler.allowed-failures": settings.retries,
         "distributed.worker.memory.terminate": False,
@@ -244,14 +244,13 @@ def _slurm(settings: EngineSettings, threads: int) -> Any:
 
 
 def worker_environment(threads: int) -> Mapping[str, str]:
-    """So that no library of a worker takes more threads than its share, and the buffers of a step stay for the next;
-    on a terminal, the display of the whole plan stays the only one.
+    """So that no library of a worker takes more threads than its share, and the buffers of a step stay for the next.
 
     With Dask's own trim threshold, 64 KiB, a training step faults some ten thousand pages: 15 % of its time.
     """
     names = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
     kept = {"MALLOC_TRIM_THRESHOLD_": str(256 << 20), "MALLOC_MMAP_THRESHOLD_": str(32 << 20)}  # bytes; glibc's largest
-    return {**dict.fromkeys(names, str(threads)), "OMP_WAIT_POLICY": "passive", WORKER: "1", **kept}
+    return {**dict.fromkeys(names, str(threads)), "OMP_WAIT_POLICY": "passive", **kept}
 
 
 def _cores() -> int:

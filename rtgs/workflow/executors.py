@@ -14,6 +14,7 @@ from typing import Protocol
 from filelock import Timeout
 
 from rtgs.track import NullTracking, RunInfo, Tracking
+from rtgs.workflow.artifacts import Artifacts
 from rtgs.workflow.expectation import Expectation, PlanClock, spoken
 from rtgs.workflow.fingerprint import flatten
 from rtgs.workflow.outcome import StepOutcome, SweepOutcomes, blocked
@@ -47,11 +48,21 @@ class Executor(Protocol):
 class InlineExecutor:
     """Steps in order, in this process; the store's locks keep other processes from doing the same work twice."""
 
-    def __init__(self, store: Store, tracking: Tracking | None = None, remote: RemoteStore | None = None) -> None:
-        """``remote``: looked into before a step is run, and given what was run."""
+    def __init__(
+        self,
+        store: Store,
+        tracking: Tracking | None = None,
+        remote: RemoteStore | None = None,
+        *,
+        quiet: bool = False,
+    ) -> None:
+        """``remote``: looked into before a step is run, and given what was run. ``quiet``: another process shows how
+        far the plan is."""
         self.store = store
         self.tracking = tracking or NullTracking()
         self.remote = remote
+        self.quiet = quiet
+        self.artifacts = Artifacts()  # what the steps read, shared among them
 
     def execute(self, plan: Plan) -> tuple[StepResult, ...]:
         """Bring every step of the plan into the store.
@@ -151,7 +162,7 @@ class InlineExecutor:
             with self.tracking.run(info) as tracker:
                 tracker.params({key: _scalar(value) for key, value in flatten(step.recipe).items()})
                 messages = logging.getLogger(f"rtgs.{step.name}")
-                context = StepContext(inputs, attempt, partial, messages, tracker, executed)
+                context = StepContext(inputs, attempt, partial, messages, tracker, executed, self.artifacts, self.quiet)
                 step.run(step.params, context)
                 return self.store.publish(step, attempt, time.perf_counter() - start)
         except Exception as error:

@@ -7,15 +7,17 @@ import logging
 import pickle
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from rtgs.core.errors import RtgsError
 from rtgs.track.protocol import Tracker
+from rtgs.workflow.artifacts import Artifacts
 from rtgs.workflow.fingerprint import fingerprint, recipe_params
 
+T = TypeVar("T")
 _NAME = re.compile(r"[a-z][a-z0-9_]*")
 
 
@@ -31,6 +33,8 @@ class StepContext:
         tracker: where parameters, curves and pictures of this execution go.
         executed: fingerprints of the steps that ran so far under this plan; the others came from the cache. Only for
             telling people: a result must not depend on it.
+        artifacts: what steps of this run have read of artifacts already; see :meth:`read`.
+        quiet: another process shows how far the plan is, so this step draws no display of its own.
     """
 
     inputs: dict[str, Path]
@@ -39,6 +43,12 @@ class StepContext:
     log: logging.Logger
     tracker: Tracker
     executed: frozenset[str] = frozenset()
+    artifacts: Artifacts = field(default_factory=Artifacts)
+    quiet: bool = False
+
+    def read(self, name: str, reader: Callable[[Path], T]) -> T:
+        """The artifact of the step ``name`` through ``reader``; read once for all steps of a run, so never changed."""
+        return self.artifacts.read(reader, self.inputs[name])
 
 
 StepFunction = Callable[[Any, StepContext], None]

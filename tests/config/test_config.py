@@ -17,6 +17,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
 from pipelines.planning.graph import build_graph
+from pipelines.planning.inspection import Inspections
 from rtgs.config import RunConfig, compose
 from rtgs.config.compose import VERSION_BASE
 from rtgs.config.convert import derive_name, to_run_config
@@ -27,7 +28,6 @@ from rtgs.config.sweep import compose_jobs
 from rtgs.core.build import build
 from rtgs.core.errors import RtgsError
 from rtgs.evaluate.tables import PAPER_SCORES
-from rtgs.scenes.once import captures_read_once
 from rtgs.train.settings import ScheduleSettings
 from rtgs.workflow.fingerprint import fingerprint
 
@@ -200,22 +200,22 @@ def test_method_preset_and_ablation_compose_and_no_ablation_is_idle():
     """
     methods = {name: methods_of(name) for name in ABLATIONS}
     keys: dict[tuple[str, str, str], str] = {}
-    with captures_read_once():
-        for method in choices_of("method"):
-            mine = ["none", *(name for name in ABLATIONS if method in methods[name])]
-            words = [f"method={method}", f"preset={','.join(choices_of('preset'))}", f"ablation={','.join(mine)}"]
-            for job in compose_jobs(["scene=ball_statue", *words], multirun=True)[0]:
-                chosen = dict(word.split("=") for word in job.words)
-                assert job.config is not None, job.problem
-                assert job.choices is not None
-                assert job.config.ablation.why
-                last = build_graph(job.config, job.choices).training[-1]
-                keys[method, chosen["preset"], chosen["ablation"]] = last.fingerprint
-        for name in ABLATIONS:
-            for method in set(choices_of("method")) - set(methods[name]):
-                words = ["scene=ball_statue", f"method={method}", "preset=smoke", f"ablation={name}"]
-                (job,) = compose_jobs(words, multirun=True)[0]
-                assert f"ablation={name} takes nothing away from method {method}" in job.problem
+    inspections = Inspections()
+    for method in choices_of("method"):
+        mine = ["none", *(name for name in ABLATIONS if method in methods[name])]
+        words = [f"method={method}", f"preset={','.join(choices_of('preset'))}", f"ablation={','.join(mine)}"]
+        for job in compose_jobs(["scene=ball_statue", *words], multirun=True)[0]:
+            chosen = dict(word.split("=") for word in job.words)
+            assert job.config is not None, job.problem
+            assert job.choices is not None
+            assert job.config.ablation.why
+            last = build_graph(job.config, job.choices, inspections).training[-1]
+            keys[method, chosen["preset"], chosen["ablation"]] = last.fingerprint
+    for name in ABLATIONS:
+        for method in set(choices_of("method")) - set(methods[name]):
+            words = ["scene=ball_statue", f"method={method}", "preset=smoke", f"ablation={name}"]
+            (job,) = compose_jobs(words, multirun=True)[0]
+            assert f"ablation={name} takes nothing away from method {method}" in job.problem
     for (method, preset, ablation), key in keys.items():
         if ablation != "none":
             assert key != keys[method, preset, "none"], f"ablation {ablation} changes nothing in {method} {preset}"

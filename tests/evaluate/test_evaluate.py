@@ -11,6 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
+from rtgs.core.errors import RtgsError
 from rtgs.evaluate.evaluate import NO_TEST_VIEWS, EvaluationSettings, TimedRender, evaluate_views, write_error_maps
 from rtgs.evaluate.images import colorize, error_map
 from rtgs.evaluate.metrics import psnr, ssim
@@ -117,8 +118,12 @@ def test_json_round_trip_and_nulls(tmp_path: Path) -> None:
     document = json.loads((tmp_path / "eval" / "evaluation.json").read_text())
     assert document["mean"]["lpips_01"] is None
     assert "weights missing" in document["missing"]["lpips_01"]
-    (tmp_path / "other.json").write_text("[1]")
-    with pytest.raises(ValueError, match="not an evaluation"):
+    for text, what in (("[1]", "not an object"), ("{}", "not an evaluation"), ('{"format": ', "cannot be read")):
+        (tmp_path / "other.json").write_text(text)
+        with pytest.raises(RtgsError, match=what):
+            read_json(tmp_path / "other.json")
+    (tmp_path / "other.json").write_text(json.dumps(document | {"views": [{"view": "a"}]}))
+    with pytest.raises(RtgsError, match=r"other.json cannot be read as a record .*delete the artifact's folder"):
         read_json(tmp_path / "other.json")
 
 

@@ -23,6 +23,7 @@ from rtgs.evaluate.records import SURFACE_METRICS, EvaluationTable, ObjectFacts,
 from rtgs.evaluate.surface import hit_shares, surface_scores
 from rtgs.evaluate.table_formats import comma_separated, markdown
 from rtgs.mesh.container import ObjectMesh, write_object_mesh
+from rtgs.mesh.record import MeshRecord, MeshTruth
 from rtgs.mesh.score import container_mesh, hit_score
 from tests.mesh.shapes import camera_at
 
@@ -148,8 +149,8 @@ def test_what_no_pixel_can_tell_is_none_and_the_table_is_written(tmp_path: Path)
     pane = ObjectMesh(true, "given", 0.1, flat=True)
     hits = hit_score(pane, true, [camera])
     assert math.isnan(hits.back)
-    truth = {"distance": 0.1, "front_within_3_percent": hits.front, "back_within_3_percent": hits.back}
-    write_object_mesh(tmp_path, pane, {"silhouette_iou": 1.0, "truth": truth})
+    truth = MeshTruth(0.1, 0.1, 0.1, hits.front, hits.back, hits.normal_median)
+    write_object_mesh(tmp_path, pane, MeshRecord(silhouette_iou=1.0, truth=truth))
     known = object_facts(tmp_path, SimpleNamespace(name="ball_statue", train=(), test=()))  # type: ignore[arg-type]
     assert (known.front, known.back) == (hits.front, None)
     table = evaluated(known=known)

@@ -42,8 +42,8 @@ def test_auto_takes_a_good_hull_without_making_another() -> None:
     assert not choice.mesh.flat
     assert choice.iou.mean > 0.95
     assert set(choice.candidates) == {"hull", "pane"}
-    assert choice.decisions[0][0] == "object mesh: hull"
-    assert "silhouette IoU: hull 0.9" in choice.decisions[0][1]
+    assert choice.decisions[0].what == "object mesh: hull"
+    assert "silhouette IoU: hull 0.9" in choice.decisions[0].why
 
 
 def test_auto_compares_silhouettes_when_the_hull_is_poor() -> None:
@@ -63,7 +63,7 @@ def test_auto_compares_silhouettes_when_the_hull_is_poor() -> None:
     assert (boxes[0][1] > 0.8).all()
     without = chosen("auto", masks, settings)
     assert without.mesh.source == "hull"
-    assert any(what == "no TSDF mesh" for what, _ in without.decisions)
+    assert any(each.what == "no TSDF mesh" for each in without.decisions)
 
 
 def test_few_views_or_directions_make_no_hull() -> None:
@@ -71,12 +71,12 @@ def test_few_views_or_directions_make_no_hull() -> None:
     few = masks_of(body, ring(8))
     choice = chosen("auto", few, fuse=lambda box: (body, 0.02))
     assert choice.mesh.source == "tsdf"
-    assert any(what == "hull not chosen" and "8 masks" in why for what, why in choice.decisions)
+    assert any(each.what == "hull not chosen" and "8 masks" in each.why for each in choice.decisions)
     assert chosen("hull", few).mesh.source == "hull"  # asked for: made
     one = mask_set(ring(8), [few.views[0].mask, *[None] * 7])
     choice = chosen("auto", one, fuse=lambda box: (body, 0.02))
     assert choice.mesh.source == "tsdf"
-    assert "7 views have no mask" in choice.decisions[0][1]
+    assert "7 views have no mask" in choice.decisions[0].why
     with pytest.raises(RtgsError, match="no mesh of the transparent object can be made"):
         chosen("auto", one)
     with pytest.raises(RtgsError, match=r"neither a hull nor a pane .*ablation=two_stages"):
@@ -93,7 +93,7 @@ def test_auto_takes_no_tsdf_mesh_that_the_masks_contradict() -> None:
 
     choice = chosen("auto", few, fuse=lump)
     assert choice.mesh.source == "hull"
-    (why,) = [why for what, why in choice.decisions if what == "no TSDF mesh"]
+    (why,) = [each.why for each in choice.decisions if each.what == "no TSDF mesh"]
     assert "silhouette IoU with the masks is 0.1" in why
     assert "mesh.object.tsdf_accept 0.5" in why
     assert chosen("auto", few, replace(SETTINGS, tsdf_accept=0.05), lump).mesh.source == "tsdf"
@@ -112,7 +112,7 @@ def test_masks_of_a_pane_give_a_pane() -> None:
     masks = masks_of(pane(1.4, 1.0), in_front(15))
     choice = chosen("auto", masks)
     assert choice.mesh.flat
-    assert choice.decisions[0][0] == "object mesh: a flat pane"
+    assert choice.decisions[0].what == "object mesh: a flat pane"
     assert choice.iou.mean > 0.95
     vertices = choice.mesh.mesh.vertices
     assert np.abs(vertices[:, 1]).max() < 0.08  # a pixel is 0.03 wide
@@ -165,11 +165,11 @@ def test_drawn_panes_are_taken_where_masks_cannot_tell() -> None:
     body = masks_of(sphere(0.8, 24), ring(24))
     other = choose_object_mesh("auto", body, SETTINGS, no_fusion, moved)
     assert other.mesh.source == "hull"
-    assert any(what == "drawn panes not taken" for what, _ in other.decisions)
+    assert any(each.what == "drawn panes not taken" for each in other.decisions)
     unseen = [corners + np.array([0, 0, 1000]) for corners in panes]
     another = choose_object_mesh("auto", body, SETTINGS, no_fusion, unseen)
     assert another.mesh.source == "hull", "marks that no view shows keep nothing else from being tried"
-    assert ("drawn panes not taken", "no view has any") in [(what, why[:15]) for what, why in another.decisions]
+    assert ("drawn panes not taken", "no view has any") in [(each.what, each.why[:15]) for each in another.decisions]
     with pytest.raises(RtgsError, match="no view has any of the drawn panes"):
         drawn_pane([corners - np.array([0, 50, 0]) for corners in panes], masks.views)
 
@@ -187,7 +187,7 @@ def test_given_meshes(tmp_path: Path) -> None:
     write_mesh_ply(tmp_path / "inward.ply", replace(body, faces=body.faces[:, ::-1]))
     turned = chosen("given", masks, replace(SETTINGS, given=str(tmp_path / "inward.ply")))
     np.testing.assert_array_equal(turned.mesh.mesh.faces, body.faces)
-    assert "given mesh turned inside out" in [what for what, _ in turned.decisions]
+    assert "given mesh turned inside out" in [each.what for each in turned.decisions]
     line = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0]])
     for name, mesh, message in (
         ("far.ply", replace(body, vertices=body.vertices + 500), r"far.ply is not where the masks show .* frame"),

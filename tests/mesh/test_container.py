@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from rtgs.core.errors import RtgsError
 from rtgs.mesh.container import ObjectGuide, ObjectMesh, read_object_mesh, write_object_mesh
 from rtgs.mesh.normals import corner_normals
+from rtgs.mesh.record import MeshRecord
 from rtgs.mesh.triangles import TriangleMesh
 from tests.mesh.shapes import box, box_depths, camera_at, cylinder, join, pane, sphere, sphere_depths
 
@@ -217,12 +218,12 @@ def test_camera_in_the_object_and_behind_it() -> None:
 
 def test_files_round_trip(tmp_path: Path) -> None:
     mesh = ObjectMesh(sphere(1.0, 8), "hull", 0.02, False)
-    write_object_mesh(tmp_path, mesh, {"iou": 0.5})
+    write_object_mesh(tmp_path, mesh, MeshRecord(silhouette_iou=0.5))
     back = read_object_mesh(tmp_path)
     assert (back.source, back.voxel, back.flat) == ("hull", 0.02, False)
     assert np.array_equal(back.mesh.faces, mesh.mesh.faces)
     (tmp_path / "mesh.json").write_text("{}")
-    with pytest.raises(RtgsError, match="no description of an object mesh"):
+    with pytest.raises(RtgsError, match="describes no object mesh"):
         read_object_mesh(tmp_path)
 
 

@@ -23,7 +23,7 @@ from safetensors import SafetensorError
 
 from pipelines.cli.main import main, report_error
 from pipelines.publishing import results
-from pipelines.publishing.results import RunRecord
+from pipelines.publishing.run_record import RunRecord
 from pipelines.steps import import_scene
 from pipelines.steps.import_scene import ImportParams
 from rtgs.config.words import friendly_overrides
@@ -114,7 +114,9 @@ def test_a_run_leaves_what_people_look_at(first):
     table = json.loads((first / "metrics.json").read_text())
     assert table["facts"]["steps"] == 12
     assert table["mean"]["psnr"] > 5
-    assert (first / "report.html").read_text().lstrip().lower().startswith("<!doctype html>")
+    page = (first / "report.html").read_text()
+    assert page.lstrip().lower().startswith("<!doctype html>")
+    assert "per view, maps included" in page  # what was timed
 
 
 def test_a_second_run_only_reads_the_cache_and_says_so(first, words, capsys):
@@ -229,11 +231,25 @@ def test_a_tracked_run_is_noted_only_in_its_own_folder(tmp_path):
     folder.mkdir()
     mine = [SimpleNamespace(step=SimpleNamespace(name="train", fingerprint="a"))]
     for steps, places in (({"train": "b"}, ()), ({"train": "a"}, ("here",))):
-        results._write_record(folder, RunRecord("named", "rtgs run", "now", {}, steps))
+        RunRecord("named", "rtgs run", "now", {}, steps).write(folder)
         results.note_tracked(folder, mine, "here")  # type: ignore[arg-type]
         record = RunRecord.read(folder)
         assert record is not None
         assert (record.steps, record.tracked) == (steps, places)
+
+
+def test_a_damaged_record_is_named_to_readers_and_replaced_by_a_run(first, words, root, capsys):
+    whole = (first / "run.json").read_text()
+    (first / "run.json").write_text(whole[:40])
+    assert main(["report", first.name]) == 1
+    assert "run.json cannot be read as a record" in (told := capsys.readouterr().err)
+    assert "delete it, and the same command writes it again" in told
+    assert main(words) == 0
+    assert "the folder is written anew" in capsys.readouterr().err
+    record = RunRecord.read(first)
+    assert record is not None
+    assert record.steps == json.loads(whole)["steps"]
+    assert main(["report", first.name]) == 0
 
 
 def test_sweeps_share_steps_and_end_with_a_table(words, first, root, capsys):
@@ -272,6 +288,27 @@ def test_mistakes_are_one_message_without_traceback(words, override, expected, c
     for text in expected:
         assert text in errors
     assert "Traceback" not in errors
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (["--multirun", "--cfg", "job"], "--multirun and --cfg exclude each other"),
+        (["--resolve"], "--resolve goes with --cfg or --help only"),
+        (["--config-dir", "/no/such/folder"], "--config-dir /no/such/folder is no folder"),
+        (["--experimental-rerun", "job.pickle"], "--experimental-rerun is not offered"),
+    ],
+)
+def test_options_that_make_no_sense_are_one_message(options, expected, capsys):
+    assert main(["run", *options]) == 1
+    assert expected in capsys.readouterr().err
+
+
+def test_a_composed_config_is_printed_and_nothing_runs(words, root, capsys):
+    before = sorted((root / "runs").glob("*"))
+    assert main([*words, "seed=41", "--cfg", "job"]) == 0
+    assert yaml.safe_load(capsys.readouterr().out)["seed"] == 41
+    assert sorted((root / "runs").glob("*")) == before
 
 
 def test_a_broken_file_of_ones_own_is_named(words, tmp_path, capsys):
@@ -348,9 +385,7 @@ def test_help_and_unknown_commands(capsys):
 
 
 def test_help_of_run_lists_groups_and_keys(capsys):
-    with pytest.raises(SystemExit) as ended:
-        main(["run", "--help"])
-    assert ended.value.code in (0, None)
+    assert main(["run", "--help"]) == 0
     shown = capsys.readouterr().out
     for text in ("method: 2dgs", "rtgs run scene.path=", "preset: ", "densify_until"):
         assert text in shown

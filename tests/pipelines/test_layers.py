@@ -2,10 +2,12 @@
 
 from pathlib import Path
 
+import pytest
 import torch
 from safetensors.torch import save_file
 
 from pipelines.steps import render, report, views
+from rtgs.core.errors import RtgsError
 
 
 def rendered_view(folder: Path, layers: bool) -> dict[str, torch.Tensor]:
@@ -25,7 +27,7 @@ def test_the_page_gets_the_diffuse_part_and_the_evaluation_the_reflection(tmp_pa
     layers = report._layers(views.read_render(tmp_path, "a.png"))
     assert set(layers) == {"diffuse", "reflection", "normal", "specular", "roughness", "f0"}
     torch.testing.assert_close(layers["diffuse"], (1 - tensors["specular"]) * tensors["diffuse"])
-    timed = render.read_timed(tmp_path, "a.png")
+    timed = render.read_timed(tmp_path, render.RenderTimes.read(tmp_path), "a.png")
     assert timed.reflection is not None
     assert torch.equal(timed.reflection, tensors["reflection"])
     assert timed.seconds == 0.5
@@ -34,4 +36,8 @@ def test_the_page_gets_the_diffuse_part_and_the_evaluation_the_reflection(tmp_pa
 def test_methods_without_reflection_have_none(tmp_path: Path) -> None:
     rendered_view(tmp_path, layers=False)
     assert report._layers(views.read_render(tmp_path, "a.png")) == {}
-    assert render.read_timed(tmp_path, "a.png").reflection is None
+    times = render.RenderTimes.read(tmp_path)
+    assert render.read_timed(tmp_path, times, "a.png").reflection is None
+    assert not times.with_maps  # artifacts of older versions timed the image alone
+    with pytest.raises(RtgsError, match=r"view 'b.png' was not rendered: render.json has a.png"):
+        times.of("b.png")

@@ -15,6 +15,7 @@ from pipelines.steps.training import stage_params
 from rtgs.config import compose
 from rtgs.gaussians.materials import has_materials
 from rtgs.gaussians.ply import read_ply
+from rtgs.scenes import canonical
 
 SECOND = ("method.reflection.cells=3", "method.reflection.matte.probation=0", "method.loss.perceptual=0")
 
@@ -40,9 +41,13 @@ def test_ablations_of_the_second_stage_share_the_first(capture: Path):  # noqa: 
 
 
 @pytest.mark.parametrize("name", ["rtgs", "envgs"])
-def test_both_stages_run_and_leave_two_sets_and_layers(root: Path, capture: Path, name: str, capsys):  # noqa: F811
+def test_both_stages_run_and_leave_two_sets_and_layers(root: Path, capture: Path, name: str, capsys, monkeypatch):  # noqa: F811
+    read: list[Path] = []
+    whole = canonical.read_scene
+    monkeypatch.setattr(canonical, "read_scene", lambda folder: read.append(folder) or whole(folder))
     words = ["run", f"scene={capture}", f"method={name}", *QUICK, *SECOND]
     assert main(words) == 0
+    assert len(read) == 1  # training, rendering, evaluation, report and tracker share the scene
     capsys.readouterr()
     store = root / "store" / "train_reflection"
     made = [manifest.parent for manifest in store.glob("*/*/manifest.json")]

@@ -4,17 +4,24 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 from PIL import Image
 
+from pipelines.cli import hydra_run
+from pipelines.cli.app import Membership
 from pipelines.cli.main import main
-from pipelines.planning.sweep import SweepStart
-from rtgs.workflow import Store
+from pipelines.planning.sweep import Sweep, SweepTask
+from rtgs.core.errors import RtgsError
+from rtgs.workflow import StepOutcome, Store, SweepOutcomes
 
 QUICK = (
     "method=2dgs",
@@ -173,15 +180,66 @@ def test_a_stock_launcher_with_its_own_processes_ends_the_same_way(capture, tmp_
     assert "2dgs" in (tmp_path / "tables" / "mine-smoke" / "table.md").read_text()
 
 
-def test_errors_that_another_sweep_left_in_the_folder_are_not_told(tmp_path, monkeypatch):
-    monkeypatch.setattr(SweepStart, "sweep", None)
+def test_errors_that_another_sweep_left_in_the_folder_are_not_told(tmp_path):
     hydra = {"sweep": {"dir": str(tmp_path)}, "runtime": {"choices": {}}, "launcher": {"_target_": "a.JoblibLauncher"}}
-    for left in ("old", ""):
-        SweepStart().on_multirun_start(OmegaConf.create({"hydra": hydra}))
-        assert SweepStart.sweep is not None
-        assert SweepStart.sweep.elsewhere
-        assert SweepStart.sweep.error_of(0) == ""
-        SweepStart.sweep.leave_error(0, RuntimeError(left))
+    for left in ("old", "new"):
+        sweep = Sweep.of(OmegaConf.create(hydra))
+        assert sweep.elsewhere
+        sweep.forget_errors()
+        assert sweep.error_of(0) == ""
+        sweep.leave_error(0, RuntimeError(left))
+        assert Sweep.of(OmegaConf.create(hydra)).error_of(0) == left  # a job finds the same sweep in its own process
+
+
+def _process_state() -> tuple[object, ...]:
+    """What Hydra and the command line keep for the whole process."""
+    hydra = HydraConfig.instance().cfg if HydraConfig.initialized() else None
+    return (*sys.argv, *sorted(os.environ.items()), GlobalHydra.instance().hydra, hydra)
+
+
+def test_two_runs_of_a_process_see_nothing_of_each_other(capture, tmp_path, monkeypatch):
+    """A sweep whose jobs all fail, then a single run, then a sweep again."""
+    seen: list[tuple[str, Membership]] = []
+
+    def refuse(config, choices, membership):
+        seen.append((config.name, membership))
+        raise RtgsError(f"{config.name} is refused")
+
+    monkeypatch.setattr(hydra_run, "execute", refuse)
+    apps: list[hydra_run.HydraApp] = []
+
+    class Kept(hydra_run.HydraApp):
+        def __init__(self) -> None:
+            super().__init__()
+            apps.append(self)
+
+    monkeypatch.setattr(hydra_run, "HydraApp", Kept)
+    words = [f"scene={capture}", "preset=smoke", "tracking=off"]
+    several = ["--multirun", "method=2dgs,3dgs"]
+    before = _process_state()
+    for folder, more in (("first", several), ("", ["method=2dgs"]), ("second", several)):
+        where = [f"hydra.sweep.dir={tmp_path / folder}"] if folder else []
+        with pytest.raises(RtgsError, match="row-2dgs-smoke is refused"):
+            hydra_run.run_hydra([*words, *more, *where])
+        assert _process_state() == before
+    first, alone, second = apps
+    assert [len(app.failures) for app in apps] == [2, 0, 2]
+    assert [app.sweep and app.sweep.folder for app in apps] == [tmp_path / "first", None, tmp_path / "second"]
+    assert str(alone.error) == "row-2dgs-smoke is refused"
+    assert (first.error, second.error) == (None, None)
+    assert [membership.sweep for _, membership in seen] == [first.sweep] * 2 + [None] + [second.sweep] * 2
+    assert not any(membership.outcomes.outcomes for _, membership in seen)
+
+
+def test_outcomes_of_a_merged_plan_reach_the_jobs_they_are_for(monkeypatch):
+    given: list[SweepOutcomes] = []
+    app = hydra_run.HydraApp()
+    monkeypatch.setattr(app, "_job", lambda composed, outcomes: given.append(outcomes))
+    mine = SweepOutcomes({"a": StepOutcome("train", "a", None, 0.0, True, "it broke", "a")})
+    assert isinstance(app, SweepTask)
+    app.after(mine)(OmegaConf.create())
+    app(OmegaConf.create())
+    assert given == [mine, SweepOutcomes({})]
 
 
 @pytest.mark.parametrize(

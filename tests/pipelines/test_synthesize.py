@@ -16,7 +16,7 @@ from PIL import Image
 pytest.importorskip("mitsuba", reason="path tracing needs the extra 'synthetic'")
 
 from pipelines.cli.main import main
-from pipelines.steps.synthesize import LineDisplay
+from pipelines.steps.display import LineDisplay
 from rtgs.scenes.scene import load_scene
 from rtgs.scenes.settings import SceneSettings
 from rtgs.scenes.synthetic import capture as captures
@@ -139,8 +139,8 @@ def test_a_full_disk_is_told_and_the_next_run_goes_on(scene, tmp_path, monkeypat
     [
         (["scene=nope"], "there is no scene 'nope'; rtgs describes ball_statue, "),
         (["width=64"], "name a scene, scene=NAME"),
-        (["scene=spheres", "width=0"], "width=0 is out of range, give 8 or more"),
-        (["scene=spheres", "samples=0"], "samples=0 is out of range"),
+        (["scene=spheres", "width=0"], "width=0 must be in 8..8192"),
+        (["scene=spheres", "samples=0"], "samples=0 must be in 1.."),
         (["scene=spheres", "truth=some"], "truth='some' is unknown: choose one of all, test, none"),
         (["scene=spheres", "widht=64"], "Did you mean width"),
         (["scene=spheres", "variant=cuda_rgb"], "variant 'cuda_rgb' is not used here"),
@@ -216,7 +216,7 @@ def test_help_names_scenes_and_keys(capsys):
 
 def test_remaining_time_counts_only_what_was_done_now(monkeypatch, capsys):
     clock = iter([100.0, 110.0, 130.0])
-    monkeypatch.setattr("pipelines.steps.synthesize.time.monotonic", lambda: next(clock))
+    monkeypatch.setattr("pipelines.steps.display.time.monotonic", lambda: next(clock))
     display = LineDisplay()
     for share in (0.5, 0.6, 0.8):  # half was finished earlier
         display.update("room view", share)

@@ -16,7 +16,7 @@ from test_app import QUICK, _in_root, root  # noqa: F401  (fixtures)
 from pipelines.cli.main import main
 from pipelines.planning.graph import RunGraph, build_graph
 from pipelines.steps.evaluate import TRACKED
-from pipelines.steps.train_transmittance import BOUNDARY_FILE
+from rtgs.evaluate.boundary import BOUNDARY_FILE
 from pipelines.steps.training import OBJECT_FOLDER, load_method, stage_params
 from rtgs.config import compose
 from rtgs.config.locate import conf_dir
@@ -99,18 +99,18 @@ def test_only_scenes_with_masks_that_show_something_get_the_third_stage(glass: P
         assert [step.name for step in without.training] == ["train_diffuse", "train_reflection"]
         assert without.mesh is None
         assert without.training[-1].params.until == 12
-        assert any(step.name == "train_transmittance" and why in step.why for step in without.skipped)
+        assert any(step.what == "train_transmittance" and why in step.why for step in without.skipped)
         _same_run(without, graph_of(without_glass, "ablation=two_stages"))
     aside = graph_of(glass, "masks=none")
     assert [step.name for step in aside.training] == ["train_diffuse", "train_reflection"]
     assert aside.scene.fingerprint != full.scene.fingerprint
     assert ("train_transmittance", "the scene has no masks of transparent objects") in {
-        (step.name, step.why) for step in aside.skipped
+        (step.what, step.why) for step in aside.skipped
     }
     two = graph_of(glass, "ablation=two_stages")
     assert [step.name for step in two.training] == ["train_diffuse", "train_reflection"]
     assert two.training[-1].params.until == 12
-    assert not any(step.name == "train_transmittance" for step in graph_of(glass, "method=2dgs").skipped)
+    assert not any(step.what == "train_transmittance" for step in graph_of(glass, "method=2dgs").skipped)
 
 
 def _same_run(run: RunGraph, two_stages: RunGraph) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from rtgs.core.errors import RtgsError
 from rtgs.prepare.errors import PrepareError
 from rtgs.prepare.masks.given import given_files, mask_file, read_given
 from rtgs.prepare.masks.settings import GivenSettings
@@ -80,9 +81,9 @@ def test_label_images(tmp_path):
     colored = np.where(INSIDE[..., None], [0, 255, 64], [200, 0, 0]).astype(np.uint8)
     path = saved(tmp_path / "colors.png", colored)
     assert (read_given(path, seen, GivenSettings(label_colors=("#00ff40",))) == INSIDE).all()
-    with pytest.raises(PrepareError, match="is no colour such as"):
+    with pytest.raises(RtgsError, match="is no colour such as"):
         GivenSettings(label_colors=("green",))
-    with pytest.raises(PrepareError, match="exclude each other"):
+    with pytest.raises(RtgsError, match="exclude each other"):
         GivenSettings(labels=(1,), label_colors=("#000000",))
 
 
@@ -123,5 +124,5 @@ def test_what_is_not_there_is_a_message(tmp_path):
     (tmp_path / "broken.png").write_bytes(b"no picture")
     with pytest.raises(CaptureError, match="cannot be read"):
         read_given(tmp_path / "broken.png", seen, GivenSettings())
-    with pytest.raises(PrepareError, match="give a share in"):
+    with pytest.raises(RtgsError, match="must be a share in"):
         GivenSettings(threshold=3)

@@ -313,11 +313,11 @@ def test_a_wrong_model_is_a_message(tmp_path, capture):
 @pytest.mark.parametrize(
     ("make_settings", "message"),
     [
-        (lambda: NormalAdapter(axes=("+x", "+y", "+y")), "give three of"),
+        (lambda: NormalAdapter(axes=("+x", "+y", "+y")), "must be three of"),
         (lambda: NormalAdapter(fit="crop"), "normals.adapter.fit='crop'"),
         (lambda: NormalSettings(model="dsin"), "did you mean 'dsine'"),
         (lambda: NormalSettings(model="custom"), "needs normals.file"),
-        (lambda: NormalSettings(tile=20), "normals.tile=20: give 0"),
+        (lambda: NormalSettings(tile=20), "normals.tile=20 must be 0"),
         (lambda: NormalSettings(tile_overlap=0.7), "normals.tile_overlap=0.7"),
         (lambda: find_network(NormalSettings(file="/nowhere/net.onnx")), "does not exist"),
     ],

@@ -147,7 +147,7 @@ def test_the_gap_around_a_scene():
     [
         (lambda: SfmSettings(use="allways"), "sfm.use='allways' is unknown.*did you mean 'always'"),
         (lambda: SfmSettings(matching=MatchingSettings(pairs="all")), "sfm.matching.pairs='all'"),
-        (lambda: SfmSettings(min_photos=1), "sfm.min_photos=1: must be at least 2"),
+        (lambda: SfmSettings(min_photos=1), "sfm.min_photos=1 must be at least 2"),
         (lambda: SfmSettings(video=VideoSettings(shift=2.0)), "sfm.video.shift=2.0"),
     ],
 )

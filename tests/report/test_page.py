@@ -15,13 +15,13 @@ import torch
 from PIL import Image
 
 from rtgs.core.cameras import Camera
+from rtgs.core.decisions import Decision
 from rtgs.evaluate.records import METRICS, EvaluationTable, RunFacts, ViewScore
 from rtgs.mesh.triangles import TriangleMesh
 from rtgs.report.figures import Curve, curve_svg, depth_picture, image_bytes, mesh_picture, normal_picture, outlined
 from rtgs.report.page import (
     PICTURE_STEPS,
     TARGET_BYTES,
-    Decision,
     MeshFigure,
     ReportData,
     ReportView,

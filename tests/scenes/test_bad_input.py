@@ -10,6 +10,7 @@ import zlib
 import numpy as np
 import pytest
 
+from rtgs.core.errors import RtgsError
 from rtgs.scenes.capture import CaptureError
 from rtgs.scenes.check import check_capture
 from rtgs.scenes.scene import load_scene
@@ -191,15 +192,15 @@ def test_duplicate_names(tmp_path):
         ({"format": "colamp"}, r"scene\.format='colamp' is unknown: .*did you mean 'colmap'\?"),
         ({"points": "sfm"}, "points='sfm' is unknown: choose one of auto, random"),
         ({"normals_frame": "opengL"}, r"did you mean 'opengl'\?"),
-        ({"long_side": 0}, "long_side=0: must be at least 1"),
-        ({"split_every": -1}, "split_every=-1: must be at least 0"),
+        ({"long_side": 0}, "long_side=0 must be at least 1"),
+        ({"split_every": -1}, "split_every=-1 must be at least 0"),
         ({"far_factor": float("nan")}, "far_factor=nan"),
-        ({"resize_ratio": 2.0}, r"resize_ratio=2.0: must lie in \(0, 1\]"),
-        ({"background": (0.0, 2.0, 0.0)}, r"background=\(0.0, 2.0, 0.0\): give three numbers between 0 and 1"),
+        ({"resize_ratio": 2.0}, r"resize_ratio=2.0 must be in \(0, 1\]"),
+        ({"background": (0.0, 2.0, 0.0)}, r"background=\(0.0, 2.0, 0.0\) must be three numbers between 0 and 1"),
     ],
 )
 def test_settings_out_of_range(keys, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(RtgsError, match=message):
         SceneSettings(**keys)
 
 

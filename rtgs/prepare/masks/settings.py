@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from rtgs.core.refuse import refuse_unknown_words
-from rtgs.prepare.errors import PrepareError
+from rtgs.core.errors import RtgsError
+from rtgs.core.refuse import refuse_below, refuse_unknown_words, refuse_unless
 
 MaskSource = Literal["auto", "none", "given", "grounded_sam2", "grabcut", "polygon"]
 MaskLayout = Literal["files", "alpha"]
@@ -44,14 +44,12 @@ class DetectorSettings:
     def __post_init__(self) -> None:
         refuse_unknown_words(self, "masks.detector")
         for key in ("box_threshold", "text_threshold", "nms_iou", "max_area"):
-            _check_share(f"masks.detector.{key}", getattr(self, key))
-        _check_least("masks.detector.max_boxes", self.max_boxes, 1)
-        _check_least("masks.detector.short_side", self.short_side, 32)
-        _check_least("masks.detector.long_side", self.long_side, self.short_side)
-        if not any(part.strip() for part in self.prompt.split(".")):
-            raise PrepareError(
-                f"setting masks.detector.prompt={self.prompt!r}: name what to look for, 'glass . bottle'"
-            )
+            _refuse_no_share(f"masks.detector.{key}", getattr(self, key))
+        refuse_below("masks.detector.max_boxes", self.max_boxes, 1)
+        refuse_below("masks.detector.short_side", self.short_side, 32)
+        refuse_below("masks.detector.long_side", self.long_side, self.short_side)
+        named = any(part.strip() for part in self.prompt.split("."))
+        refuse_unless(named, "masks.detector.prompt", repr(self.prompt), "what to look for, such as 'glass . bottle'")
 
 
 @dataclass(frozen=True)
@@ -69,8 +67,8 @@ class SegmenterSettings:
     """ONNX files. Empty: the registered names in the folders of weights."""
 
     def __post_init__(self) -> None:
-        _check_least("masks.segmenter.size", self.size, 64)
-        _check_share("masks.segmenter.min_score", self.min_score)
+        refuse_below("masks.segmenter.size", self.size, 64)
+        _refuse_no_share("masks.segmenter.min_score", self.min_score)
 
 
 @dataclass(frozen=True)
@@ -95,12 +93,12 @@ class GivenSettings:
         object.__setattr__(self, "labels", tuple(self.labels))
         object.__setattr__(self, "label_colors", tuple(self.label_colors))
         refuse_unknown_words(self, "masks.given")
-        if not (self.threshold == -1 or 0 <= self.threshold < 1):
-            raise PrepareError(f"setting masks.given.threshold={self.threshold}: give a share in [0, 1), or -1")
+        share = self.threshold == -1 or 0 <= self.threshold < 1
+        refuse_unless(share, "masks.given.threshold", self.threshold, "a share in [0, 1), or -1")
         for color in self.label_colors:
             parse_color(color)
         if self.labels and self.label_colors:
-            raise PrepareError("settings masks.given.labels and masks.given.label_colors exclude each other")
+            raise RtgsError("masks.given.labels and masks.given.label_colors exclude each other")
 
 
 @dataclass(frozen=True)
@@ -127,10 +125,10 @@ class DrawnSettings:
     photo."""
 
     def __post_init__(self) -> None:
-        _check_least("masks.drawn.grabcut_rounds", self.grabcut_rounds, 1)
-        _check_least("masks.drawn.grabcut_side", self.grabcut_side, 64)
-        _check_least("masks.drawn.min_angle", self.min_angle, 0.0)
-        _check_least("masks.drawn.frame", self.frame, 0.05)
+        refuse_below("masks.drawn.grabcut_rounds", self.grabcut_rounds, 1)
+        refuse_below("masks.drawn.grabcut_side", self.grabcut_side, 64)
+        refuse_below("masks.drawn.min_angle", self.min_angle, 0.0)
+        refuse_below("masks.drawn.frame", self.frame, 0.05)
 
 
 @dataclass(frozen=True)
@@ -155,12 +153,11 @@ class CleanSettings:
 
     def __post_init__(self) -> None:
         refuse_unknown_words(self, "masks.clean")
-        _check_least("masks.clean.voxels", self.voxels, 16)
-        _check_least("masks.clean.mask_size", self.mask_size, 64)
-        _check_least("masks.clean.min_views", self.min_views, 3)
-        _check_share("masks.clean.min_agreement", self.min_agreement)
-        if not 0 <= self.tolerated <= 0.4:
-            raise PrepareError(f"setting masks.clean.tolerated={self.tolerated}: must lie in [0, 0.4]")
+        refuse_below("masks.clean.voxels", self.voxels, 16)
+        refuse_below("masks.clean.mask_size", self.mask_size, 64)
+        refuse_below("masks.clean.min_views", self.min_views, 3)
+        _refuse_no_share("masks.clean.min_agreement", self.min_agreement)
+        refuse_unless(0 <= self.tolerated <= 0.4, "masks.clean.tolerated", self.tolerated, "in [0, 0.4]")
 
 
 @dataclass(frozen=True)
@@ -168,7 +165,7 @@ class MaskSettings:
     """Masks of transparent objects (method.md 7).
 
     Raises:
-        PrepareError: a value outside its documented range.
+        RtgsError: a value outside its documented range.
     """
 
     source: MaskSource = "auto"
@@ -189,7 +186,7 @@ def parse_color(text: str) -> tuple[int, int, int]:
     """Red, green, blue in 0..255 of ``#rrggbb``.
 
     Raises:
-        PrepareError: another form.
+        RtgsError: another form.
     """
     digits = text.removeprefix("#")
     try:
@@ -197,14 +194,8 @@ def parse_color(text: str) -> tuple[int, int, int]:
             raise ValueError
         return int(digits[:2], 16), int(digits[2:4], 16), int(digits[4:], 16)
     except ValueError:
-        raise PrepareError(f"setting masks.given.label_colors: {text!r} is no colour such as '#00ff40'") from None
+        raise RtgsError(f"masks.given.label_colors: {text!r} is no colour such as '#00ff40'") from None
 
 
-def _check_share(key: str, value: float) -> None:
-    if not 0 <= value <= 1:
-        raise PrepareError(f"setting {key}={value}: must lie between 0 and 1")
-
-
-def _check_least(key: str, value: float, least: float) -> None:
-    if not value >= least:
-        raise PrepareError(f"setting {key}={value}: must be at least {least:g}")
+def _refuse_no_share(key: str, value: float) -> None:
+    refuse_unless(0 <= value <= 1, key, value, "between 0 and 1")

@@ -7,8 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from rtgs.core.refuse import refuse_unknown_words
-from rtgs.prepare.errors import PrepareError
+from rtgs.core.refuse import refuse_unknown_words, refuse_unless
 
 NormalNetwork = Literal["stablenormal", "dsine", "omnidata", "metric3d"]
 _AXES = ("+x", "-x", "+y", "-y", "+z", "-z")
@@ -20,7 +19,7 @@ class NormalAdapter:
     """How a normal network wants its picture and what its numbers mean.
 
     Raises:
-        PrepareError: axes that are not three different ones, an unknown way to fit.
+        RtgsError: axes that are not three different ones, an unknown way to fit.
     """
 
     input: str = ""
@@ -50,10 +49,10 @@ class NormalAdapter:
     def __post_init__(self) -> None:
         object.__setattr__(self, "axes", tuple(self.axes))
         refuse_unknown_words(self, "normals.adapter")
-        if len(self.axes) != 3 or {axis[-1:] for axis in self.axes} != set("xyz") or set(self.axes) - set(_AXES):
-            raise PrepareError(
-                f"setting normals.adapter.axes={list(self.axes)}: give three of {', '.join(_AXES)}, one for each axis"
-            )
+        each_once = len(self.axes) == 3 and {axis[-1:] for axis in self.axes} == set("xyz")
+        known = not set(self.axes) - set(_AXES)
+        allowed = f"three of {', '.join(_AXES)}, one for each axis"
+        refuse_unless(each_once and known, "normals.adapter.axes", list(self.axes), allowed)
 
     @property
     def matrix(self) -> np.ndarray:

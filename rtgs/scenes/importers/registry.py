@@ -10,7 +10,6 @@ from rtgs.scenes.importers.blender import is_blender, read_blender
 from rtgs.scenes.importers.colmap import find_model, incomplete_model, read_colmap
 from rtgs.scenes.importers.embedded import embedded_capture
 from rtgs.scenes.importers.transforms import is_transforms, read_transforms
-from rtgs.scenes.once import remembered
 from rtgs.scenes.settings import CaptureError, SceneSettings
 
 EMBEDDED_PREFIX = "embedded:"
@@ -63,7 +62,6 @@ def find_format(root: Path, settings: SceneSettings) -> str | None:
     return "blender" if is_blender(root) else None
 
 
-@remembered
 def read_capture(settings: SceneSettings) -> Capture:
     """Read poses, lenses and points of a capture; no pixels.
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from rtgs.core.errors import RtgsError
-from rtgs.core.refuse import refuse_unknown_words
+from rtgs.core.refuse import refuse_below, refuse_unknown_words, refuse_unless
 
 _LARGEST_SIDE = 8192
 
@@ -59,20 +58,16 @@ class CaptureSettings:
     def __post_init__(self) -> None:
         for name, least in (("width", 8), ("height", 8), ("samples", 1), ("test_samples", 2), ("test_every", 1)):
             value = getattr(self, name)
-            if not least <= value <= (_LARGEST_SIDE if name in ("width", "height") else 1 << 20):
-                raise RtgsError(f"synthesize: {name}={value} is out of range, give {least} or more")
+            largest = _LARGEST_SIDE if name in ("width", "height") else 1 << 20
+            refuse_unless(least <= value <= largest, f"synthesize: {name}", value, f"in {least}..{largest}")
         refuse_unknown_words(self, "synthesize")
-        if not 1 <= self.jpeg_quality <= 100:
-            raise RtgsError(f"synthesize: jpeg_quality={self.jpeg_quality} must lie in 1..100")
-        if not 0 < self.normal_scale <= 1:
-            raise RtgsError(f"synthesize: normal_scale={self.normal_scale} must lie in (0, 1]")
+        quality, scale = self.jpeg_quality, self.normal_scale
+        refuse_unless(1 <= quality <= 100, "synthesize: jpeg_quality", quality, "in 1..100")
+        refuse_unless(0 < scale <= 1, "synthesize: normal_scale", scale, "in (0, 1]")
         for name in ("normal_tilt", "normal_noise", "seed"):
-            if getattr(self, name) < 0:
-                raise RtgsError(f"synthesize: {name}={getattr(self, name)} must not be negative")
+            refuse_below(f"synthesize: {name}", getattr(self, name), 0)
         for name, least in (("points", 1), ("min_track", 1), ("noise", 0)):
-            value = getattr(self.features, name)
-            if value < least:
-                raise RtgsError(f"synthesize: features.{name}={value} is out of range, give {least} or more")
+            refuse_below(f"synthesize: features.{name}", getattr(self.features, name), least)
 
     def is_test(self, index: int) -> bool:
         """Whether the view of this index in name order is a test view."""

@@ -1,0 +1,90 @@
+"""The render step: what it stores, and that it renders each view once for each choice of masks."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from pipelines.steps import render
+from pipelines.steps.views import read_render
+from rtgs.core.cameras import Camera
+from rtgs.methods import RenderedView, RenderOptions
+from rtgs.render.buffers import RasterBuffers
+from rtgs.scenes.canonical import save_scene
+from rtgs.scenes.scene import Scene, View
+from rtgs.track.null import NullTracker
+from rtgs.workflow import StepContext
+
+HEIGHT, WIDTH = 6, 8
+
+
+@dataclass
+class CountingMethod:
+    """Shows one colour per choice of masks, and remembers what it was asked for."""
+
+    glass: bool
+    maps: tuple[str, ...] = ("depth", "normal")
+    asked: list[tuple[str, RenderOptions]] = field(default_factory=list)
+
+    def render(self, camera: Camera, step: int, options: RenderOptions, mask: torch.Tensor | None) -> RenderedView:
+        assert step == 100
+        self.asked.append((camera.name, options))
+        image = torch.full((3, HEIGHT, WIDTH), 0.75 if options.masks else 0.25)
+        empty = torch.zeros(HEIGHT, WIDTH)
+        buffers = RasterBuffers(image, empty + 1, empty + 2 if options.depth else None, None)
+        transparent = mask if self.glass else None
+        return RenderedView(camera, image, buffers, transparent=transparent)
+
+
+def view(index: int, *, masked: bool) -> View:
+    eye = torch.eye(3, dtype=torch.float64)
+    camera = Camera(eye, torch.zeros(3, dtype=torch.float64), 8.0, 8.0, 4.0, 3.0, WIDTH, HEIGHT, name=f"{index}.png")
+    mask = torch.ones(HEIGHT, WIDTH, dtype=torch.bool) if masked else None
+    return View(camera, torch.full((3, HEIGHT, WIDTH), 0.5), mask, None, f"{index}.png")
+
+
+@pytest.fixture
+def context(tmp_path: Path) -> StepContext:
+    for name in ("scene", "out", "partial"):
+        (tmp_path / name).mkdir()
+    views = (view(0, masked=True), view(1, masked=False))
+    scene = Scene("two", (view(2, masked=True),), views, torch.zeros(4, 3), torch.zeros(4, 3), 1.0, "test")
+    save_scene(scene, tmp_path / "scene")
+    inputs = {"import_scene": tmp_path / "scene", "train_diffuse": tmp_path}
+    return StepContext(inputs, tmp_path / "out", tmp_path / "partial", logging.getLogger("test"), NullTracker())
+
+
+def run(context: StepContext, method: CountingMethod, monkeypatch: pytest.MonkeyPatch, *, maps: bool) -> None:
+    monkeypatch.setattr(render, "last_training", lambda inputs: inputs["train_diffuse"])
+    monkeypatch.setattr(render, "load_method", lambda folder, scene: (method, SimpleNamespace(until=100)))
+    render.render(render.RenderParams(maps=maps), context)
+
+
+@pytest.mark.parametrize("maps", [True, False])
+def test_a_view_is_rendered_once_for_each_choice_of_masks(context, monkeypatch, maps: bool) -> None:
+    method = CountingMethod(glass=True)
+    run(context, method, monkeypatch, maps=maps)
+    options = RenderOptions(depth=maps, normal=maps, layers=maps)
+    given = RenderOptions(masks="given")
+    assert method.asked == [("0.png", options), ("0.png", given), ("1.png", options)]
+    tensors = read_render(context.out, "0.png")
+    assert set(tensors) == {"image", render.GIVEN, *(("depth", "alpha") if maps else ())}
+    assert tensors["image"].unique().tolist() == [0.25]
+    assert tensors[render.GIVEN].unique().tolist() == [0.75]
+    times = render.RenderTimes.read(context.out)
+    assert set(times.seconds) == {"0.png", "1.png"}
+    assert times.with_maps == maps  # the seconds say what they are of
+    assert min(times.seconds.values()) > 0
+
+
+def test_without_transparent_objects_given_masks_are_not_rendered(context, monkeypatch) -> None:
+    method = CountingMethod(glass=False)
+    run(context, method, monkeypatch, maps=True)
+    assert [name for name, _ in method.asked] == ["0.png", "1.png"]
+    timed = render.read_timed(context.out, replace(render.RenderTimes.read(context.out)), "1.png")
+    assert torch.equal(timed.image, read_render(context.out, "1.png")["image"])
