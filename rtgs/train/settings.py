@@ -219,7 +219,7 @@ class ReflectionSettings:
     opacity_reset_every: int = 6_000  # 0 = never; only while densifying
     sh_every: int = 1_000  # one degree more each, from the start of the stage
     specular_reset: bool = True  # decision 25: at resets of the base set k_s becomes min(k_s, initial)
-    cells: int = 32  # per axis of the box: stratified random points (16 at 256x192: kernels.md)
+    cells: int = 32  # per axis of the box: stratified random points
     per_cell: int = 5
     # The points' box reaches at least so far from its middle on every axis, times the extent; 0 = as it is.
     # EnvGS's boxes reach 3.8 (spheres), 2.7 (toycar), 4.2 and 1.9 (sedan) extents.
@@ -231,13 +231,13 @@ class ReflectionSettings:
     background: str = "black"
     offset: float = 1e-4  # of the mirror ray's start, times the extent (method.md 6.3; EnvGS 0)
     smallest_alpha: float = 1e-2  # pixels with less coverage have no surface to reflect at
-    rebuild_every: int = 100  # steps between new trees; in between the tree is refitted (kernels.md)
+    rebuild_every: int = 100  # steps between new trees; in between the tree is refitted (docs/tracer.md)
     # Times the rates of colours and scales: the set starts from noise when the base set is half done.
     rate_gain: float = 1.0
     transmittance_cutoff: float = 1e-4
     alpha_cutoff: float = 1 / 255
     direction_gradient: str = "full"  # decision 24; "last_sh": what EnvGS's public tracer returns
-    # Register row 23, of every traced colour: at unit directions, or "raw": rays keep the camera ray's length (EnvGS).
+    # Decision 23, of every traced colour: at unit directions, or "raw": rays keep the camera ray's length (EnvGS).
     sh_direction: str = "unit"
     propagation: PropagationSettings = field(default_factory=PropagationSettings)
     traced: TracedShareSettings = field(default_factory=TracedShareSettings)
@@ -293,11 +293,11 @@ class TransmittanceSettings:
     enabled: bool = True  # False: the run ends after the second stage
     start: float = 1 / 3  # share of the run: 20,000 of 60,000
     first_bounce: str = "transmittance"  # decision 26: what it meets; "base": the base set inside; "none": nothing
-    first_bounce_end: str = "open"  # row 17, the paper relies on L_d; "clip": no hit counts behind the back surface
-    second_bounce: str = "mesh"  # row 27: begins at the mesh's back; "first_bounce": at z_s + Z_1; "none"
-    second_bounce_gradient: bool = True  # row 13: it teaches the base set
-    second_offset: float = 2.0  # row 14: it begins so many voxels behind the back surface
-    compositing: str = "over"  # row 12: C_1 + (1 - A_1) C_2; "sum": C_1 + C_2
+    first_bounce_end: str = "open"  # decision 17: L_d alone; "clip": no hit counts behind the back surface
+    second_bounce: str = "mesh"  # decision 27: begins at the mesh's back; "first_bounce": at z_s + Z_1; "none"
+    second_bounce_gradient: bool = True  # decision 13: it teaches the base set
+    second_offset: float = 2.0  # decision 14: it begins so many voxels behind the back surface
+    compositing: str = "over"  # decision 12: C_1 + (1 - A_1) C_2; "sum": C_1 + C_2
     first_surface: str = "mesh"  # where the object's pixels have their surface; the paper: "base", the rasterised depth
     normal: str = "base"  # the rasterised normals there (of the interface, if there is one); "mesh": fixed, for tests
     max_gain: float | None = None  # S_max in the object's pixels; None: optics.max_gain
@@ -313,12 +313,12 @@ class TransmittanceSettings:
     sh_degree: int = 3  # of the transmittance set, at most
     split: bool = True  # base surfels inside the mesh become the transmittance set; the paper: a random set (False)
     split_margin: float = 1.0  # voxels outside the mesh that still count as inside
-    box: str = "object"  # row 16, of a random set; "scene": the paper
+    box: str = "object"  # decision 16, of a random set; "scene": the paper
     cells: int = 32  # per axis of the box, as the reflection set
     per_cell: int = 5
     most_hits: float = 80.0  # of a ray through the random set: its surfels are shrunk until no more are expected
-    freeze_base: bool = True  # row 18: density control and resets of the base set end here; False: EnvGS's windows
-    test_masks: str = "silhouette"  # row 21: of the mesh, needs no mask at test views; "given": the scene's
+    freeze_base: bool = True  # decision 18: density control and resets of the base set end here
+    test_masks: str = "silhouette"  # decision 21: of the mesh; "given": the scene's
     offset: float = 1e-4  # of the first bounce's start, times the extent
     opaque: float = 1 / 255  # no second bounce where the first leaves less light than this
     densify_from: int = 500

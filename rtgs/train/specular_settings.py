@@ -104,7 +104,7 @@ class MatteSettings:
 
 @dataclass(frozen=True)
 class InterfaceSettings:
-    """Opaque surfels on the transparent object's mesh: the surface that photos alone do not form (glass.md).
+    """Opaque surfels on the transparent object's mesh: the surface that photos alone do not form (decision 31).
 
     They are rasterised with the base set, have its materials, and learn with it; rays that have entered the object do
     not meet them.
