@@ -18,12 +18,14 @@ SINGLE = ("README.md", "CONTRIBUTING.md", "Makefile", "CMakeLists.txt", "pyproje
 SUFFIXES = frozenset({".py", ".pyi", ".md", ".yaml", ".yml", ".toml", ".cpp", ".h", ".cmake", ""})
 SKIPPED = frozenset({"__pycache__", "data", "images", ".venv", "build"})
 EXAMPLES = frozenset({"citations.py", "test_citations.py"})  # of tests/docs: full of citations that lead nowhere
-MADE = frozenset({"docker/.env", "rtgs/runs", "rtgs/steps"})  # by a person, and experiments of MLflow: no folders
+# By a person or a command, and experiments of MLflow.
+MADE = frozenset({"docker/.env", "benchmarks/results", "lab/results", "rtgs/runs", "rtgs/steps"})
 
 _BREAK = re.compile(r"\n[ \t]*(?:#+|//+|\*|>)?[ \t]*")
 _NUMBER = r"\d+(?:\.\d+)*"
-_LIST = rf"{_NUMBER}(?:(?:, (?:and |to )?| and | to ){_NUMBER})*"
-_SECTION = re.compile(rf"\bmethod\.md(?:'s)?\)?,? +({_LIST})(?![\w%])")
+_NEXT = rf"(?:(?:, (?:and |to )?| and | to ){_NUMBER})*"
+_LIST = rf"{_NUMBER}{_NEXT}"
+_SECTION = re.compile(rf"\bmethod\.md(?:'s)?\)?,? +({_NUMBER}(?: \"[^\"\n]*\")?{_NEXT})(?![\w%])")
 _TITLE = re.compile(r"([\w/-]+\.md)(?:#[\w-]+)?\)?(?:,? +[\d.]+)?,? +\"([^\"\n]{3,60})\"")
 _DECISION = re.compile(rf"\b[Dd]ecisions? ({_LIST})(?!\w)")
 _OLD = re.compile(r"\b[Rr]egister rows? \d+")
@@ -34,7 +36,7 @@ _LINK = re.compile(r"(?<!`)!?\[[^\]]*\]\(([^()\s]+)\)")
 _CODE = re.compile(r"(?<![:`])(`+)([^`\n]+)\1")
 _PLACE = re.compile(rf"(?<![\w/.-])((?:{'|'.join(FOLDERS)})/[\w./*<>{{}},\[\]-]*[\w>}}*/])")
 _ROLE = re.compile(r":(mod|func|class|meth|attr|data|exc|obj):`~?([^`]+)`")
-_DOTTED = re.compile(r"^(?:rtgs|pipelines|benchmarks|tests)(?:\.\w+)+$")
+_DOTTED = re.compile(r"^(?:rtgs|pipelines|benchmarks|lab|tests)(?:\.\w\w+)+$")  # rtgs.x.y stands for any name
 
 
 @dataclass(frozen=True)
@@ -215,7 +217,7 @@ def places(library: Library, path: Path, text: str) -> Iterator[Finding]:
     for found in _PLACE.finditer(text):
         place = found[1] if "{" in found[1] else found[1].rstrip("}")
         judged = path.suffix == ".md" or Path(place).suffix in (".py", ".cpp", ".h", ".md", ".yaml", ".toml")
-        if judged and place not in library.made and not library.exists(place):
+        if judged and place.rstrip("/") not in library.made and not library.exists(place):
             yield found.start(), f"there is no {place}"
     if path.suffix == ".md":
         for found in _CODE.finditer(text):

@@ -82,6 +82,7 @@ GOOD_AND_BAD = [  # file, a citation that is there, one that is not, what is sai
     ("rtgs/box.cpp", "// see method.md\n// 14", "// see method.md\n// 5", "no section 5"),
     ("docs/mesh.md", "[method.md](method.md) 4.2", "[method.md](method.md) 4.9", "no section 4.9"),
     ("rtgs/box.py", '# method.md 4.2 "Post"', '# method.md 4.2 "Past"', "no heading or bold word 'Past'"),
+    ("rtgs/box.py", '# method.md 4.2 "Post", 4 and 14', '# method.md 4.2 "Post", 4 and 9', "no section 9"),
     ("rtgs/box.py", '# docs/mesh.md, "Which mesh"', '# docs/mesh.md, "What mesh"', "no heading or bold word"),
     ("rtgs/box.py", "# decision 3", "# decision 4", "no decision 4"),
     ("conf/method/envgs.yaml", "# decisions 1 to 3", "# decisions 1 to 4", "no decision 4"),
