@@ -150,7 +150,7 @@ def _propagation(config: RunConfig) -> list[str]:
 
 
 def _masked_gain(config: RunConfig) -> float:
-    """What brings the weight of L_mono to 0.2 (glass.md: 0.05 does little, 0.2 forms the glass)."""
+    """What brings the weight of L_mono to 0.2 (decision 47: 0.05 does little, 0.2 forms the glass)."""
     return 0.2 / (config.method.loss.mono_normal * config.method.loss.mono_normal_gain)
 
 

@@ -1,4 +1,4 @@
-"""The core stands without the tools around it (architecture.md, rule 1)."""
+"""The core stands without the tools around it (docs/architecture.md, rule 1)."""
 
 from __future__ import annotations
 

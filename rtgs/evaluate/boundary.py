@@ -1,4 +1,4 @@
-"""How well a method knows the surface of a transparent object: its third stage stands and falls with it (glass.md)."""
+"""How well a method knows the surface of a transparent object, on which its third stage depends."""
 
 from __future__ import annotations
 

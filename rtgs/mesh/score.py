@@ -11,7 +11,7 @@ from rtgs.core.cameras import Camera
 from rtgs.mesh.container import ObjectGuide, ObjectMesh
 from rtgs.mesh.triangles import TriangleMesh
 
-_RELATIVE = 0.03  # of the depth: glass.md's "within 3 %"
+_RELATIVE = 0.03  # of the depth: nearer than this is the same surface (docs/mesh.md, "Figures")
 
 
 def container_mesh(name: str) -> TriangleMesh | None:

@@ -93,7 +93,7 @@ class ReflectionSettings:
     opacity_reset_every: int = 6_000  # 0 = never; only while densifying
     sh_every: int = 1_000  # one degree more each, from the start of the stage
     specular_reset: bool = True  # decision 25: at resets of the base set k_s becomes min(k_s, initial)
-    cells: int = 32  # per axis of the box: stratified random points (16 at 256x192: kernels.md)
+    cells: int = 32  # per axis of the box: stratified random points
     per_cell: int = 5
     # The points' box reaches at least so far from its middle on every axis, times the extent; 0 = as it is.
     # EnvGS's boxes reach 3.8 (spheres), 2.7 (toycar), 4.2 and 1.9 (sedan) extents.
@@ -105,7 +105,7 @@ class ReflectionSettings:
     background: Literal["black", "mean", "bright"] = "black"
     offset: float = 1e-4  # of the mirror ray's start, times the extent (method.md 6.3; EnvGS 0)
     smallest_alpha: float = 1e-2  # pixels with less coverage have no surface to reflect at
-    rebuild_every: int = 100  # steps between new trees; in between the tree is refitted (kernels.md)
+    rebuild_every: int = 100  # steps between new trees; in between the tree is refitted (docs/tracer.md)
     # Times the rates of colours and scales: the set starts from noise when the base set is half done.
     rate_gain: float = 1.0
     transmittance_cutoff: float = 1e-4
@@ -135,7 +135,7 @@ class ReflectionSettings:
 
 @dataclass(frozen=True)
 class InterfaceSettings:
-    """Opaque surfels on the transparent object's mesh: the surface that photos alone do not form (glass.md).
+    """Opaque surfels on the transparent object's mesh: the surface that photos alone do not form (decision 31).
 
     They are rasterised with the base set, have its materials, and learn with it; rays that have entered the object do
     not meet them.

@@ -1,4 +1,4 @@
-"""The microfacet weights of one mirror ray and one straight ray, in closed form (method.md 4, paper eq. 5 to 9).
+"""The microfacet weights of one mirror ray and one straight ray, in closed form (method.md 4, paper eq. 8 to 11).
 
 Plain torch, any dtype, differentiable. With the half vector at the normal (a mirror ray) the Torrance-Sparrow term has
 one cosine c = n . omega_o = n . omega_i and one width g, and needs no half vector:
@@ -19,7 +19,7 @@ from torch import Tensor
 
 from rtgs.optics.settings import OpticsSettings
 
-REMAP_COEFFICIENTS = (1.62142, 0.819955, 0.1734, 0.0171201, 0.000640711)  # of ln(alpha)^k, paper eq. 8
+REMAP_COEFFICIENTS = (1.62142, 0.819955, 0.1734, 0.0171201, 0.000640711)  # of ln(alpha)^k, paper eq. 10
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ def microfacet_width(roughness: Tensor, settings: OpticsSettings) -> Tensor:
 
 
 def ggx_distribution(cosine_half: Tensor, width: Tensor) -> Tensor:
-    """D: isotropic Trowbridge-Reitz of n . omega_h (paper eq. 7), 1/sr."""
+    """D: isotropic Trowbridge-Reitz of n . omega_h (paper eq. 9), 1/sr."""
     square = width * width
     return square / (math.pi * (cosine_half * cosine_half * (square - 1) + 1) ** 2)
 

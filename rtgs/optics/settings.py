@@ -21,7 +21,7 @@ class OpticsSettings:
     # "literal": the paper's blend without the cosine; "split_sum": its ablation; "envgs": 1
     weight: Weight = "microfacet"
     # S_max, bound of the microfacet gain: 1 conserves energy and is nearly the same from all angles, 0 = no bound (the
-    # paper), 16 = method.md 4.4; chosen in docs/reflection.md.
+    # paper); decision 5.
     max_gain: float = 1.0
     remap: Remap = "pbrt"  # width g(alpha) of the paper, once squared in D and G; "none": g = alpha
     roughness_floor: float = 1e-3  # argument of g (PBRT): below 1.55e-4 the remap turns round
@@ -29,7 +29,7 @@ class OpticsSettings:
     cosine_floor: float = 1e-3  # of n . omega_o
     literal_cosine_floor: float = 0.1  # the same for "literal", which divides by it
     detach_cosine: bool = False  # keep the weight's gradient away from the normal
-    # In which light C_d, C_r and C_t are mixed: their sRGB encoding, as the paper, or linear light (glass.md).
+    # In which light C_d, C_r and C_t are mixed: their sRGB encoding, as the paper, or linear light (decision 48).
     blend: Blend = field(default="srgb", metadata={"recipe": "unless default"})
 
     def __post_init__(self) -> None:

@@ -1,7 +1,7 @@
 """LPIPS v0.1 on VGG-16 (Zhang et al. 2018), from the published weights.
 
-The network was calibrated on images scaled to [-1, 1]. The 3DGS family and EnvGS feed it [0, 1] (method.md 0.8 and
-9), so their figures are another quantity; both are offered, by name:
+The network was calibrated on images scaled to [-1, 1]. The 3DGS family and EnvGS feed it [0, 1] (method.md 9),
+so their figures are another quantity; both are offered, by name:
 
 - ``lpips_01``: images fed as they are, in [0, 1]: comparable with the papers' tables;
 - ``lpips_11``: scaled to [-1, 1]: LPIPS as defined.

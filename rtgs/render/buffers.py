@@ -15,7 +15,7 @@ class RasterOptions:
 
     near: float = 0.2  # world units: surfels with a centre at or before it are culled, hits before it do not count
     far: float = 100.0  # world units: only the distortion's depth mapping uses it
-    transmittance_cutoff: float = 1e-4  # a pixel stops after the surfel that takes T below it (kernels.md, Semantics)
+    transmittance_cutoff: float = 1e-4  # a pixel stops after the surfel that takes T below it
     alpha_cutoff: float = 1 / 255  # a contribution with less alpha is skipped; it also bounds a surfel's support
     depth: bool = False
     median_depth: bool = False
@@ -72,13 +72,13 @@ class TraceOptions:
 
     t_min: float | Tensor = 0.0  # hits with t <= t_min do not count
     t_max: float | Tensor = math.inf  # hits with t >= t_max do not count
-    transmittance_cutoff: float = 1e-4  # the ray stops after the hit that takes T below it (kernels.md, Semantics)
+    transmittance_cutoff: float = 1e-4  # the ray stops after the hit that takes T below it
     alpha_cutoff: float = 1 / 255  # a hit with less alpha is skipped; it also bounds a surfel's support
     sh_degree: int = 3  # coefficients above it are left out; capped by what the surfels hold
     depth: bool = False
     normal: bool = False
     weight_sum: bool = False
-    direction_gradient: Literal["full", "last_sh"] = "full"  # last_sh: as EnvGS's public tracer (method.md 0 item 6)
+    direction_gradient: Literal["full", "last_sh"] = "full"  # last_sh: as EnvGS's public tracer (decision 24)
     sh_direction: Literal["unit", "raw"] = "unit"  # raw: at directions as they are given, as EnvGS's public tracer
     order: Literal["auto", "given", "sorted"] = "auto"  # of the rays in the kernel: as given, or by Morton code
 

@@ -1,7 +1,7 @@
 """Tracking into MLflow: a SQLite database and an artifact folder beside it, or a server.
 
 Only the client interface with explicit run ids is used, so an ``MLFLOW_RUN_ID`` in the environment is neither resumed
-nor ended (platform.md B), and threads and processes do not share an active run.
+nor ended, and threads and processes do not share an active run.
 """
 
 from __future__ import annotations

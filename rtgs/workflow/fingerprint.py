@@ -1,4 +1,4 @@
-"""Recipe fingerprints: SHA-256 of canonical JSON (platform.md A.4), and digests of files.
+"""Recipe fingerprints: SHA-256 of canonical JSON (docs/pipeline.md), and digests of files.
 
 A fingerprint names a *recipe* (what would be computed), so the keys of a whole graph are known before anything runs.
 """

@@ -94,7 +94,7 @@ class Step:
 
     @cached_property
     def fingerprint(self) -> str:
-        """64 hexadecimal digits that name this recipe (platform.md A.4)."""
+        """64 hexadecimal digits that name this recipe (docs/pipeline.md)."""
         return fingerprint(
             {
                 "step": self.name,

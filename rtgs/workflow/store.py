@@ -1,4 +1,4 @@
-"""The artifact store: one content-addressed folder per recipe, published by one rename (platform.md A.4).
+"""The artifact store: one content-addressed folder per recipe, published by one rename (docs/pipeline.md).
 
 Layout under the root::
 

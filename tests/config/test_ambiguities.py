@@ -1,75 +1,73 @@
-"""Every open question of the paper is a config key (method.md 10)."""
+"""docs/decisions.md tells the truth: every decision is a config key, has the value it states, and can be changed."""
 
 from __future__ import annotations
 
 from dataclasses import asdict
+from functools import cache
+from itertools import zip_longest
 
 import pytest
 
 from rtgs.config import compose
+from rtgs.config.schema import RunConfig
 from rtgs.workflow.fingerprint import flatten
+from tests.docs.register import DEFAULT, LABELS, REGISTER, entries, overrides_of, setting_of, value_of
 
-# Row of method.md 10: the key that decides it, the decision of `method=rtgs preset=paper`, and the alternative kept.
-REGISTER: dict[int, list[tuple[str, object, object]]] = {
-    1: [("method.optics.weight", "microfacet", "literal")],
-    2: [("method.optics.remap", "pbrt", "none")],
-    3: [("method.optics.roughness_floor", 1e-3, 1e-4)],
-    4: [("method.optics.masking", "correlated", "separable")],
-    5: [("method.optics.max_gain", 1.0, 16.0)],
-    6: [
-        ("method.materials.f0_channels", 1, 3),
-        ("method.materials.f0", 0.9, 0.04),
-        ("method.materials.roughness", 0.002, 0.005),
-        ("method.optimizer.f0_logits", 0.005, 0.01),
-        ("method.optimizer.roughness_logits", 0.005, 0.01),
-    ],
-    7: [("method.render.depth_ratio", 0.0, 1.0)],
-    8: [("method.materials.normalized", True, False)],
-    9: [("method.loss.specular_start", 1 / 3, 0.05)],
-    10: [("method.loss.specular_target", 0.9, 1.0)],
-    11: [
-        ("method.loss.transmission_depth_form", "accum", "mean"),
-        ("method.loss.transmission_depth_form", "accum", "per_hit"),
-    ],
-    12: [("method.transmittance.compositing", "over", "sum")],
-    13: [("method.transmittance.second_bounce_gradient", True, False)],
-    14: [("method.transmittance.second_offset", 2.0, 0.0)],
-    15: [("mesh.of", "object", "scene")],
-    16: [("method.transmittance.box", "object", "scene")],
-    17: [("method.transmittance.first_bounce_end", "open", "clip")],
-    18: [("method.transmittance.freeze_base", True, False)],
-    19: [("method.loss.mono_normal_form", "cosine", "envgs")],
-    20: [("method.loss.perceptual_form", "lpips", "vgg_l1")],
-    21: [("method.transmittance.test_masks", "silhouette", "given")],
-    22: [("scene.resize_ratio", None, 0.125), ("scene.split_every", 8, 10)],
-    23: [("method.reflection.sh_direction", "unit", "raw")],
-    24: [("method.reflection.direction_gradient", "full", "last_sh")],
-    25: [("method.reflection.specular_reset", True, False)],
-    26: [
-        ("method.transmittance.first_bounce", "transmittance", "base"),
-        ("method.transmittance.first_bounce", "transmittance", "none"),
-    ],
-    27: [("method.transmittance.second_bounce", "mesh", "first_bounce")],
-    28: [("method.materials.specular", 1e-3, 0.1), ("schedule.sh_from", 0, 10_000)],
-}
-ROWS = 28
-ENTRIES = [(row, *entry) for row, entries in REGISTER.items() for entry in entries]
+OPEN_QUESTIONS = 28  # of the paper; what follows them are rtgs's own differences
+DECISIONS = entries(REGISTER.read_text(encoding="utf-8"))
+SETTINGS = [setting for decision in DECISIONS for setting in decision.settings]
 
 
-def test_no_row_is_left_out():
-    assert set(REGISTER) == set(range(1, ROWS + 1))
-    for row, entries in REGISTER.items():
-        assert all(decision != alternative for _, decision, alternative in entries), row
-
-
-@pytest.fixture(scope="module")
-def decided() -> dict[str, object]:
-    config, _ = compose(["scene=demo", "method=rtgs", "preset=paper"])
+@cache
+def composed(overrides: tuple[str, ...]) -> dict[str, object]:
+    """The flat config of a run with these overrides."""
+    scene = () if any(item.startswith("scene=") for item in overrides) else ("scene=demo",)
+    config, _ = compose([*scene, *overrides])
     return flatten(asdict(config))
 
 
-@pytest.mark.parametrize(("row", "key", "decision", "alternative"), ENTRIES)
-def test_a_row_is_a_key_with_the_decision_and_its_alternative(decided, row, key, decision, alternative):
-    assert decided[key] == decision, f"row {row}"
-    config, _ = compose(["scene=demo", "method=rtgs", "preset=paper", f"{key}={alternative}"])
-    assert flatten(asdict(config))[key] == alternative, f"row {row}"
+def test_the_register_is_complete():
+    numbers = [decision.number for decision in DECISIONS]
+    assert numbers == list(range(1, len(numbers) + 1))
+    assert len(numbers) > OPEN_QUESTIONS
+    for decision in DECISIONS:
+        assert decision.labels == LABELS, decision.number
+        assert decision.settings, decision.number
+        for setting in decision.settings:
+            assert DEFAULT in setting.here, setting.key
+            assert setting.also, setting.key
+            assert setting.here[DEFAULT] not in setting.also, setting.key
+
+
+def test_every_key_stands_once_and_is_one_of_the_schema():
+    keys = [setting.key for setting in SETTINGS]
+    assert len(keys) == len(set(keys))
+    assert set(keys) <= set(flatten(asdict(RunConfig())))
+
+
+@pytest.mark.parametrize("setting", SETTINGS, ids=lambda setting: setting.key)
+def test_a_decision_is_what_the_config_composes_to(setting):
+    for overrides, value in setting.here.items():
+        assert composed(overrides)[setting.key] == value, overrides
+
+
+def test_every_alternative_is_accepted():
+    columns = zip_longest(*([(setting.key, value) for value in setting.also] for setting in SETTINGS))
+    for column in columns:  # the first alternative of every key together, then the second ones, ...
+        wanted = dict(pair for pair in column if pair is not None)
+        words = [f"{key}={'null' if value is None else value}" for key, value in wanted.items()]
+        config, _ = compose(["scene=demo", *DEFAULT, *words])
+        found = flatten(asdict(config))
+        assert {key: found[key] for key in wanted} == wanted
+
+
+def test_how_the_register_is_read():
+    assert [value_of(text) for text in ("1/3", "null", "true", "0.05", "mesh")] == [1 / 3, None, True, 0.05, "mesh"]
+    read = setting_of("a.b", "`1/60`; `preset=quick`: `0.1`", "`0.0`, `1.0`")
+    assert read.here == {DEFAULT: 1 / 60, ("method=rtgs", "preset=quick"): 0.1}
+    assert read.also == (0.0, 1.0)
+    assert overrides_of("ablation=mcmc") == (*DEFAULT, "ablation=mcmc")
+    with pytest.raises(ValueError, match="here"):
+        setting_of("a.b", "`1.0`, but not always", "`0.0`")
+    with pytest.raises(ValueError, match="decision 7"):
+        entries("## 7. A title\n\n| key | here | also |\n|---|---|---|\n| `a.b` | `1.0` |\n")

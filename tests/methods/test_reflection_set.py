@@ -20,7 +20,7 @@ from rtgs.methods.settings import PropagationSettings, ReflectionSettings
 from rtgs.render.buffers import TraceOptions
 from rtgs.render.reference.trace import find_hits, traced_rays, traced_surfels
 
-MOST_HITS = 80  # of a ray at the start (kernels.md: 32^3 x 5 whole surfels cost 161)
+MOST_HITS = 80  # of a ray at the start (the published 32^3 x 5 whole surfels cost 161)
 
 
 def test_every_cell_of_the_box_gets_its_points():

@@ -99,14 +99,14 @@ def test_schlick_at_its_ends():
     assert schlick(f64(0.04), f64(0.5)).item() == pytest.approx(0.04 + 0.96 / 32)
 
 
-def test_the_weights_are_those_of_the_memo():
+def test_the_weights_at_points_worked_out_by_hand():
     one = f64(1.0)
     plain = specular_weights(one, f64(1e-3), f64(0.04), replace(DEFAULT, max_gain=0.0))
     assert float(plain.reflection / plain.fresnel) == pytest.approx(35.6, rel=3e-3)
-    memo = replace(DEFAULT, max_gain=16.0)
-    dielectric = specular_weights(one, f64(5e-3), f64(0.04), memo)
+    bounded = replace(DEFAULT, max_gain=16.0)
+    dielectric = specular_weights(one, f64(5e-3), f64(0.04), bounded)
     assert float(dielectric.reflection) == pytest.approx(0.2, abs=0.005)
-    mirror = specular_weights(one, f64(0.04), f64(0.5), memo)
+    mirror = specular_weights(one, f64(0.04), f64(0.5), bounded)
     assert float(mirror.reflection) == pytest.approx(0.5, abs=0.02)
     literal = specular_weights(
         f64(0.02), f64(1e-3), f64(0.04), OpticsSettings(weight="literal", literal_cosine_floor=0.01)

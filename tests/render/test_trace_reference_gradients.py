@@ -119,7 +119,7 @@ def test_the_probe_does_not_move_anything():
 
 
 def test_last_sh_leaves_the_direction_only_the_last_colours_term():
-    """method.md 0 item 6: the geometric term and all but the last contributor's SH term are lost; nothing else is."""
+    """Decision 24: the geometric term and all but the last contributor's SH term are lost; nothing else is."""
     scene = smooth_scene().rays(torch.tensor([0]))
     names = tuple(name for name in NAMES if name != "directions")
     for full, last in zip(

@@ -1,4 +1,4 @@
-"""The presets' schedules keep the rules that short runs need (issue: intervals of 100 steps, at most 3 resets)."""
+"""The presets' schedules keep the rules that short runs need (intervals of 100 steps, at most 3 resets)."""
 
 from __future__ import annotations
 

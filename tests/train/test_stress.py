@@ -1,4 +1,4 @@
-"""Learning rates x30 on noise: nothing becomes non-finite (issue figure; the clamps of method.md 14 see to it)."""
+"""Learning rates x30 on noise: nothing becomes non-finite (the clamps of method.md 14 see to it)."""
 
 from __future__ import annotations
 

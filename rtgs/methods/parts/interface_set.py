@@ -1,4 +1,4 @@
-"""The interface: opaque surfels with materials on the transparent object's mesh (glass.md, "Design to try first")."""
+"""The interface: opaque surfels with materials on the transparent object's mesh (decision 31)."""
 
 from __future__ import annotations
 

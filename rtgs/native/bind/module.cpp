@@ -3,7 +3,7 @@
 NB_MODULE(_core, m) {
   // A rendered view that is alive when the interpreter ends (its autograd graph, in a traceback or a global) is no leak.
   nb::set_leak_warnings(false);
-  m.doc() = "rtgs native core: CPU kernels in explicit SIMD, chosen at run time (see rtgs/native/isa.h)";
+  m.doc() = "rtgs native core: CPU kernels in explicit SIMD, chosen at run time (see rtgs/native/common/isa.h)";
   rtgs::bind_isa(m);
   rtgs::bind_image(m);
   rtgs::bind_surfels(m);

@@ -97,7 +97,7 @@ void mirror_rays_backward(const MirrorPixels& in, const MirrorRays& upstream, co
 namespace {
 
 constexpr float kLn2 = 0.69314718055994531f, kFourPi = 12.566370614359172f;
-constexpr float kRemap[] = {1.62142f, 0.819955f, 0.1734f, 0.0171201f, 0.000640711f};  // of ln(alpha)^k, paper eq. 8
+constexpr float kRemap[] = {1.62142f, 0.819955f, 0.1734f, 0.0171201f, 0.000640711f};  // of ln(alpha)^k, paper eq. 10
 
 struct Microfacet {  // w_r = F / (1 / S + 1 / S_max) of kLanes pixels, and what its derivative needs
   vfloat cosine, roughness, logarithm, f0, width, slant, inverse, fresnel, power4, weight;

@@ -234,7 +234,8 @@ def joined(parts: list[SurfaceSample]) -> SurfaceSample:
 
 
 def save_normals(normals: np.ndarray, path: Path) -> None:
-    """Write canonical normals as ``.npy`` of half floats (a thousandth of a radian), for :func:`read_normals`."""
+    """Write canonical normals as ``.npy`` of half floats (a thousandth of a radian), for
+    :func:`rtgs.scenes.images.read_normals`."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f"{path.name}.part")
     with partial.open("wb") as stream:
