@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from mirror_scene import MirrorScene, mirror_scene
-
+from benchmarks.common.mirror_scene import MirrorScene, mirror_scene
 from rtgs.methods import create_method
 from rtgs.methods.reflective import ReflectiveMethod
 from rtgs.optics.settings import OpticsSettings
