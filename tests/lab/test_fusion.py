@@ -1,4 +1,4 @@
-"""The table "which fusion" of docs/mesh.md at a size that a test can afford."""
+"""The table "which fusion" of docs/lab/mesh.md at a size that a test can afford."""
 
 from pathlib import Path
 
