@@ -11,7 +11,13 @@ ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 LONGEST = 120  # characters of a line that is neither a row of a table nor a link
 MOST_WORDS = 950  # of a page that has no limit of its own
-LIMITS = {"README.md": 550, "docs/README.md": 300, "docs/transmittance.md": 750, "docs/rasterizer.md": 1_300}
+LIMITS = {
+    "README.md": 550,
+    "docs/README.md": 300,
+    "docs/architecture.md": 1_100,
+    "docs/rasterizer.md": 1_500,
+    "docs/transmittance.md": 750,
+}
 REFERENCES = {"docs/method.md", "docs/decisions.md"}  # looked up by number, not read through
 LAST_LINE = 90  # of README: one screen of substance
 TARGET = re.compile(r"\]\([^()\s]+\)")
