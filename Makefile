@@ -77,11 +77,11 @@ e2e: setup ## long end-to-end runs
 	$(BIN)/python -m pytest -m slow
 
 bench: setup ## speed and error figures, each a JSON object on its last line
-	$(BIN)/python -m benchmarks.raster
-	$(BIN)/python -m benchmarks.losses
-	$(BIN)/python -m benchmarks.gaussians
-	$(BIN)/python -m benchmarks.train_step
-	$(BIN)/python -m benchmarks.speed_error --quick
+	$(BIN)/python -m benchmarks.speed.raster
+	$(BIN)/python -m benchmarks.speed.losses
+	$(BIN)/python -m benchmarks.speed.gaussians
+	$(BIN)/python -m benchmarks.speed.train_step
+	$(BIN)/python -m benchmarks.speed.speed_error --quick
 
 lint: setup ## ruff and pyright
 	$(BIN)/ruff check .

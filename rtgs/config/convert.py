@@ -13,6 +13,8 @@ from omegaconf.errors import OmegaConfBaseException
 from rtgs.config.schema import Choices, RunConfig
 from rtgs.core.build import build
 from rtgs.core.errors import RtgsError
+from rtgs.methods import find_method, own_methods
+from rtgs.methods.spec import FEATURES
 
 _UNTELLING = {"images", "input", "rgb", "sparse", "colmap", "0", "data", "dense", "undistorted"}
 
@@ -30,11 +32,7 @@ def to_run_config(composed: DictConfig, choices: Choices) -> tuple[RunConfig, Ch
         raise RtgsError(f"config: {error}; set it on the command line or in its YAML file") from error
     assert isinstance(values, dict)
     config = build(RunConfig, {str(key): value for key, value in values.items()})
-    if config.ablation.methods and config.method.name not in config.ablation.methods:
-        raise RtgsError(
-            f"config: ablation={choices.ablation} takes nothing away from method {config.method.name}: it is for "
-            f"{', '.join(config.ablation.methods)}"
-        )
+    _refuse_idle_ablation(config, choices)
     scene = config.scene
     if config.table.data == "paper" and scene.path.startswith("embedded:"):
         raise RtgsError(
@@ -55,6 +53,25 @@ def to_run_config(composed: DictConfig, choices: Choices) -> tuple[RunConfig, Ch
     if name != Path(name).name or name == "..":
         raise RtgsError(f"config: name={name!r} is to be one folder in runs/: give a name without / that is not ..")
     return replace(config, name=name), choices
+
+
+def _refuse_idle_ablation(config: RunConfig, choices: Choices) -> None:
+    """An ablation is for methods that have what it takes away.
+
+    Raises:
+        RtgsError: the method has not.
+    """
+    needs = set(config.ablation.needs)
+    if unknown := sorted(needs - set(FEATURES)):
+        raise RtgsError(
+            f"config: ablation.needs names {', '.join(unknown)}: methods may have {', '.join(FEATURES)} (rtgs.methods.spec)"
+        )
+    if needs and (lacking := sorted(needs - find_method(config.method.name).has)):
+        fit = ", ".join(spec.name for spec in own_methods() if needs <= spec.has)
+        raise RtgsError(
+            f"config: ablation={choices.ablation} takes nothing away from method {config.method.name}, which has no "
+            f"{', '.join(lacking)}: it is for {fit}"
+        )
 
 
 def _absolute(path: str) -> str:

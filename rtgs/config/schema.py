@@ -72,8 +72,8 @@ class AblationConfig:
 
     why: str = ""
     """One line: what the flipped keys take away and what should be seen."""
-    methods: tuple[str, ...] = ()
-    """Methods that have what is taken away; others are refused. Empty: all."""
+    needs: tuple[str, ...] = ()
+    """What a method must have for it (:data:`rtgs.methods.spec.FEATURES`); others are refused. Empty: nothing."""
 
 
 @dataclass(frozen=True)

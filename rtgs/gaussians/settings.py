@@ -120,7 +120,7 @@ class MaterialSettings:
     specular: float = 1e-3  # initial k_s: EnvGS 1e-3 (decision 28: for all scenes); 0.1 for gardenspheres
     # Initial roughness and reflectance at normal incidence, decision 6. With S_max 1 the weight w_r starts at 0.85
     # and stays there to grazing, close to EnvGS's 1. With method.md 4.4's 0.005 and 0.04 it starts at 0.2: a mirror
-    # ray is darker than what it replaces, and k_s falls before the reflection set has learned (docs/reflection.md).
+    # ray is darker than what it replaces, and k_s falls before the reflection set has learned (docs/lab/reflection.md).
     roughness: float = 0.002
     f0: float = 0.9
     f0_channels: Literal[1, 3] = 1  # decision 6: the paper writes a scalar; 3 = rgb

@@ -25,7 +25,7 @@ SOURCES = ("hull", "tsdf", "given")
 MERGE_VOXELS = 2.0  # crossings nearer than this are one wall (method.md 6.3)
 BOX_MARGIN = 0.05  # of the object box, on each side (method.md 6.2)
 _BOX_POINTS = 0.005  # share of the points behind a pane that its box leaves out at either end of each axis
-_NORMAL_ROUNDS, _NORMAL_REACH = 2, 5.0  # of smoothing; voxels; measured in docs/mesh.md
+_NORMAL_ROUNDS, _NORMAL_REACH = 2, 5.0  # of smoothing; voxels; measured in docs/lab/mesh.md
 _BATCH = 65536  # points whose rays are cast at once
 
 

@@ -42,7 +42,7 @@ class TsdfSettings:
 
 @dataclass(frozen=True)
 class HullSettings:
-    """Numbers of the carving; measured in docs/mesh.md."""
+    """Numbers of the carving; measured in docs/lab/mesh.md."""
 
     voxels: int = 96  # along the longest side of the object
     outvoted: int = AUTOMATIC  # k: masks that may be wrong about a point; -1: what agrees best with most masks

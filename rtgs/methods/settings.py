@@ -64,7 +64,7 @@ class MatteSettings:
     probation: float = 1 / 60  # share of the run: then the stage is judged, before any propagation or reset; 0 = never
     views: int = 12  # training views looked at, evenly spaced
     # A pixel counts as specular when its k_s is at least this; with fewer of them than the share the scene is matte.
-    # Measured on a mirror ball of strength 0 / 0.3 / 0.8 (docs/reflection.md): at most 0.04 % / at least 3 % / 2 %.
+    # Measured on a mirror ball of strength 0 / 0.3 / 0.8 (docs/lab/reflection.md): at most 0.04 % / at least 3 % / 2 %.
     specular: float = 0.15
     share: float = 0.002
 
@@ -147,7 +147,7 @@ class InterfaceSettings:
     scale: float = 1.0  # times the distance to the neighbours
     specular: float = 0.9  # initial k_s: L_spec's target
     # With both and transmittance.max_gain 16, w_r starts near 0.8, bounded by transmittance.max_weight; f0 0.05 starts
-    # near 0.25 and ends as well (docs/transmittance.md).
+    # near 0.25 and ends as well (docs/lab/transmittance.md).
     f0: float = 0.15  # initial
     roughness: float = 0.005  # initial
     # Weight of 1 - n . N of the mesh in the masks. 0 = none: n is as rasterised, and the base set with its labels and
@@ -207,7 +207,7 @@ class TransmittanceSettings:
     max_weight: float = 1.0
     rim: int = 2
     # Share of the masked pixels whose base depth is the object's first surface; with more the object is opaque and the
-    # stage left out (docs/transmittance.md: thin glass 0.05 to 0.5). 1: never.
+    # stage left out (docs/lab/transmittance.md: thin glass 0.05 to 0.5). 1: never.
     opaque_share: float = 0.9
     keep_seen: int = 3  # views that see a surfel bare, from which on it stays in the base set too; 0: all go
     sh_degree: int = 3  # of the transmittance set, at most

@@ -78,7 +78,7 @@ class Network:
                 return port
         raise PrepareError(
             f"{self.path} has no {kind} {name!r}, but {', '.join(map(str, ports))}: it is another model, or exported "
-            "with other names; set the adapter's names (docs/prepare.md)"
+            "with other names; set the adapter's names (docs/networks.md)"
         )
 
     def require(self, inputs: Sequence[str], outputs: Sequence[str]) -> None:

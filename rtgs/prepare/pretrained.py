@@ -33,7 +33,7 @@ __all__ = [
     "weights_report",
 ]
 
-_ANY_EXPORT = "torch.onnx.export of the authors' model with input (1, 3, H, W), names as in docs/prepare.md"
+_ANY_EXPORT = "torch.onnx.export of the authors' model with input (1, 3, H, W), names as in docs/networks.md"
 _SAM2_EXPORT = (
     "take onnx/{part}.onnx and its .onnx_data (which keeps its name) of the published export "
     "onnx-community/sam2.1-hiera-tiny-ONNX, or python -m samexporter.export_sam2 (github.com/vietanhdev/samexporter)"

@@ -16,6 +16,7 @@ import yaml
 from pipelines.planning.graph import build_graph
 from rtgs.config.locate import choices_of, conf_dir
 from rtgs.config.sweep import ComposedJob, compose_jobs
+from rtgs.methods import find_method
 from rtgs.scenes.once import captures_read_once
 from rtgs.workflow.plan import topological
 
@@ -59,8 +60,8 @@ def fitting(method: str) -> list[str]:
     """The ablations that are for the method, ``none`` first."""
     found = ["none"]
     for name in choices_of("ablation"):
-        methods = yaml.safe_load((conf_dir() / "ablation" / f"{name}.yaml").read_text())["ablation"].get("methods")
-        if name != "none" and (not methods or method in methods):
+        needs = set(yaml.safe_load((conf_dir() / "ablation" / f"{name}.yaml").read_text())["ablation"].get("needs", ()))
+        if name != "none" and needs <= find_method(method).has:
             found.append(name)
     return found
 

@@ -28,6 +28,7 @@ from rtgs.config.sweep import compose_jobs
 from rtgs.core.build import build
 from rtgs.core.errors import RtgsError
 from rtgs.evaluate.tables import PAPER_SCORES
+from rtgs.methods import find_method
 from rtgs.train.settings import ScheduleSettings
 from rtgs.workflow.fingerprint import fingerprint
 
@@ -295,7 +296,8 @@ def raw_configs(groups: str, keys: Sequence[tuple[str, ...]]) -> dict[tuple[str,
 
 def methods_of(ablation: str) -> tuple[str, ...]:
     """The methods that have what an ablation takes away."""
-    return tuple(ablation_file(ablation)["ablation"].get("methods") or choices_of("method"))
+    needs = set(ablation_file(ablation)["ablation"].get("needs", ()))
+    return tuple(name for name in choices_of("method") if needs <= find_method(name).has)
 
 
 def ablation_file(name: str) -> dict:

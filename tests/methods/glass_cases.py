@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from mirror_scene import BALL, RADIUS, ball_hit, mirror_scene, room_hit, wall_color
 from reflective_cases import recipe, schedule
 from torch import Tensor
 
+from benchmarks.common.mirror_scene import BALL, RADIUS, ball_hit, mirror_scene, room_hit, wall_color
 from rtgs.gaussians.settings import DensitySettings, InitSettings
 from rtgs.mesh.container import ObjectMesh
 from rtgs.mesh.triangles import TriangleMesh

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from mirror_scene import MirrorScene, mirror_scene
-
+from benchmarks.common.mirror_scene import MirrorScene, mirror_scene
 from rtgs.core.cameras import Camera
 from rtgs.gaussians.settings import DensitySettings, InitSettings, OptimizerSettings
 from rtgs.methods import Mode, RenderOptions, create_method

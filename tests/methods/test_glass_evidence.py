@@ -8,10 +8,10 @@ from dataclasses import replace
 import pytest
 import torch
 from glass_cases import INTERFACE, GlassScene, begun, glass_recipe, glass_scene, new_glass_method, train_stages
-from mirror_scene import BALL, RADIUS, ball_hit
 from reflective_cases import schedule, use
 from torch import Tensor
 
+from benchmarks.common.mirror_scene import BALL, RADIUS, ball_hit
 from rtgs.core.cameras import Camera
 from rtgs.mesh.container import ObjectGuide, ObjectSurfaces
 from rtgs.methods import Mode, RenderOptions

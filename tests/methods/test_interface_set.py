@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 import torch
 from glass_cases import INTERFACE, GlassScene, begun, glass_recipe, glass_scene, held, new_glass_method, train_stages
-from mirror_scene import BALL
 
+from benchmarks.common.mirror_scene import BALL
 from rtgs.gaussians.density import select_rows
 from rtgs.methods.parts.interface_set import interface_surfels, normal_quaternions
 from rtgs.train.method import Mode

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 import torch
 from glass_cases import GlassScene, ball_mesh, begun, glass_recipe, glass_scene, held, new_glass_method, train_stages
-from mirror_scene import BALL
 from reflective_cases import schedule, use
 
+from benchmarks.common.mirror_scene import BALL
 from rtgs.core.errors import RtgsError
 from rtgs.evaluate.boundary import boundary_scores
 from rtgs.gaussians.density import logit

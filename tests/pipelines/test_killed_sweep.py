@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from test_sweep import capture  # noqa: F401  (fixture)
 
-from benchmarks.kill_sweep import Executions, Tally, judge, killed_sweep, table_of, together
+from benchmarks.quality.kill_sweep import Executions, Tally, judge, killed_sweep, table_of, together
 
 TINY = (
     "method=2dgs",

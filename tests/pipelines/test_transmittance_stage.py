@@ -16,10 +16,10 @@ from test_app import QUICK, _in_root, root  # noqa: F401  (fixtures)
 from pipelines.cli.main import main
 from pipelines.planning.graph import RunGraph, build_graph
 from pipelines.steps.evaluate import TRACKED
-from rtgs.evaluate.boundary import BOUNDARY_FILE
 from pipelines.steps.training import OBJECT_FOLDER, load_method, stage_params
 from rtgs.config import compose
 from rtgs.config.locate import conf_dir
+from rtgs.evaluate.boundary import BOUNDARY_FILE
 from rtgs.mesh.container import read_object_mesh
 from rtgs.methods.model import Model
 from rtgs.scenes.canonical import read_scene

@@ -1,6 +1,6 @@
 """Poses of real photographs from the images alone, beside the poses they come with (RTGS_SHARED, default ../shared).
 
-A few photos of two sets, small; ``python -m benchmarks.sfm`` measures all photos of all sets.
+A few photos of two sets, small; ``python -m benchmarks.quality.sfm`` measures all photos of all sets.
 """
 
 from __future__ import annotations

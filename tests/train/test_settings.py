@@ -39,7 +39,7 @@ def test_what_holds_the_normals_of_glass_is_never_negative(name):
 
 @pytest.mark.parametrize("preset", ["smoke", "quick", "standard", "paper"])
 def test_glass_holds_its_own_normals_and_not_the_rasterised_ones(preset):
-    """docs/transmittance.md: 20 and 0, whatever the preset; a recipe without it is one from before it."""
+    """docs/lab/transmittance.md: 20 and 0, whatever the preset; a recipe without it is one from before it."""
     own = compose(["scene=demo", "method=rtgs", f"preset={preset}"])[0].method.transmittance.interface
     assert (own.normal_hold, own.normal_loss) == (20.0, 0.0)
     free = compose(["scene=demo", "method=rtgs", f"preset={preset}", "method.transmittance.interface.normal_hold=0"])[0]

@@ -55,7 +55,7 @@ void bind_mirror(nb::module_& m) {
     RTGS_DISPATCH(mirror_rays, in, out);
   }, nb::arg("normal"), nb::arg("depth"), nb::arg("view"), nb::arg("center"), nb::arg("shortest_normal"), nb::arg("raw"),
      nb::arg("origins"), nb::arg("directions"), nb::arg("cosine"), nb::arg("threads"),
-     "Fills origins, directions (P, 3) and cosine (P) of the mirror rays of P pixels; see rtgs/methods/mirror.py.");
+     "Fills origins, directions (P, 3) and cosine (P) of the mirror rays of P pixels; see rtgs/methods/shading/mirror.py.");
   m.def("mirror_rays_backward", [](Floats normal, Floats depth, Floats view, Center center, float shortest_normal,
                                    bool raw, Floats to_origins, Floats to_directions, Floats to_cosine,
                                    Floats to_normal, Floats to_depth, int threads) {

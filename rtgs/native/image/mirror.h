@@ -1,4 +1,4 @@
-// Mirror rays and their microfacet weight, pixel by pixel. Twins: rtgs/methods/mirror.py, rtgs/optics/microfacet.py.
+// Mirror rays and their microfacet weight, pixel by pixel. Twins: rtgs/methods/shading/mirror.py, rtgs/optics/microfacet.py.
 #pragma once
 #include <cstdint>
 

@@ -140,7 +140,7 @@ class Detector:
         if unknown:
             raise PrepareError(
                 f"{network.path} also wants {', '.join(unknown)}: exports of the original repository take other text "
-                "inputs; take that of transformers' GroundingDinoForObjectDetection (docs/prepare.md)"
+                "inputs; take that of transformers' GroundingDinoForObjectDetection (docs/networks.md)"
             )
         self._network, self._settings = network, settings
         phrases = split_prompt(settings.prompt)

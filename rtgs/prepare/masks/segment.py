@@ -81,7 +81,7 @@ class Segmenter:
         if unknown:
             raise PrepareError(
                 f"{decoder.path} also wants {', '.join(unknown)}: it is a decoder for videos, or another export; "
-                "take one for single images (docs/prepare.md)"
+                "take one for single images (docs/networks.md)"
             )
 
     @property
@@ -167,5 +167,5 @@ def _find_layout(encoder: Network, decoder: Network) -> _Layout:
     raise PrepareError(
         f"{encoder.path} ({ports}) is no encoder of SAM 2 in the layout of transformers (pixel_values -> "
         "image_embeddings.0 .1 .2) or samexporter (image -> high_res_feats_0, high_res_feats_1, image_embed): SAM 1 "
-        "and other exports differ; docs/prepare.md says how to make it"
+        "and other exports differ; docs/networks.md says how to make it"
     )

@@ -63,7 +63,7 @@ class CaptureRecord:
     reflected_in_mask: float | None
     reflected_in_specular: float | None
     psnr_specular_2dgs: float | None = None  # dB on mirror, gloss and glass of `method=2dgs preset=quick`
-    psnr_rest_2dgs: float | None = None  # dB elsewhere of the same run; both set by `python -m benchmarks.difficulty`
+    psnr_rest_2dgs: float | None = None  # dB elsewhere of the same run; both set by benchmarks.quality.difficulty
 
     def labelled(self, name: str) -> str:
         """How tables, pages and logs name the scene: nobody may take a stand-in for a paper's data."""

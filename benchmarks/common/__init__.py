@@ -1,0 +1,1 @@
+"""What tools and experiments share: scenes that are made here, training runs, clocks, the machine, a plot."""
