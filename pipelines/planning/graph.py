@@ -46,6 +46,7 @@ KINDS: tuple[StepKind, ...] = (
 )
 """Every kind of step there is; the guard against forgotten version bumps goes through them."""
 
+ABSENT = "absent"  # in the place of a network's digest
 _NOT_SHOWN = ("paths.", "tracking.", "table.", "name", "threads", "scene.path", "method.paper_schedule.")
 
 
@@ -129,6 +130,7 @@ def _training(config: RunConfig, prepared: Preparation, transparent: bool) -> tu
     steps: list[Step] = []
     object_mesh = None
     spec = find_method(method.name)
+    networks = tuple(found for found in _pretrained() if found[1] != ABSENT)  # without them the key stays as it was
     for stage in spec.timeline(method, config.schedule, transparent=transparent):
         own = spec.stage(stage.name)
         read = own.reads(method)  # so that runs that differ elsewhere share the stage
@@ -137,7 +139,7 @@ def _training(config: RunConfig, prepared: Preparation, transparent: bool) -> tu
             drawn = (step for step in prepared.steps if draws_panes(step))
             object_mesh = extract_mesh.STEP.step(extract_mesh.object_params(config), *drawn, scene, *steps)
         mesh = () if object_mesh is None else (object_mesh,)
-        steps.append(train.train_step(spec, params, scene, *steps, *mesh))
+        steps.append(train.train_step(spec, params, scene, *steps, *mesh, networks=networks))
     return tuple(steps), object_mesh
 
 
@@ -156,7 +158,7 @@ def _pretrained() -> tuple[tuple[str, str], ...]:
             find_weights(file)
             found.append((name, file.sha256))
         except MissingWeights:
-            found.append((name, "absent"))
+            found.append((name, ABSENT))
     return tuple(found)
 
 

@@ -76,4 +76,4 @@ def sfm(params: SfmParams, context: StepContext) -> None:
     )
 
 
-STEP = StepKind("sfm", 4, sfm)
+STEP = StepKind("sfm", 5, sfm)

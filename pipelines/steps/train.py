@@ -76,10 +76,18 @@ def kind_of(stage: StageSpec) -> StepKind:
     return StepKind(f"train_{stage.name}", stage.version, train)
 
 
-def train_step(spec: MethodSpec, params: StageParams, *upstream: Step) -> Step:
-    """The step of one stage of a method. The source of a method from outside belongs to the recipe: no review of this
-    project asks for a new version when it changes."""
-    tools = () if is_own(spec) else ((f"method {spec.name}", _source_digest(spec)),)
+def train_step(
+    spec: MethodSpec, params: StageParams, *upstream: Step, networks: tuple[tuple[str, str], ...] = ()
+) -> Step:
+    """The step of one stage of a method.
+
+    ``networks``: (name, digest) of the pretrained files that are on this machine; they belong to the recipe where the
+    perceptual loss reads them. So does the source of a method from outside: no review of this project asks for a new
+    version when it changes.
+    """
+    tools = networks if params.method.loss.perceptual > 0 else ()
+    if not is_own(spec):
+        tools = (*tools, (f"method {spec.name}", _source_digest(spec)))
     return kind_of(spec.stage(params.stage)).step(params, *upstream, tools=tools)
 
 

@@ -63,9 +63,7 @@ def _refuse_idle_ablation(config: RunConfig, choices: Choices) -> None:
     """
     needs = set(config.ablation.needs)
     if unknown := sorted(needs - set(FEATURES)):
-        raise RtgsError(
-            f"config: ablation.needs names {', '.join(unknown)}: methods may have {', '.join(FEATURES)} (rtgs.methods.spec)"
-        )
+        raise RtgsError(f"config: ablation.needs names {', '.join(unknown)}: methods may have {', '.join(FEATURES)}")
     if needs and (lacking := sorted(needs - find_method(config.method.name).has)):
         fit = ", ".join(spec.name for spec in own_methods() if needs <= spec.has)
         raise RtgsError(

@@ -30,9 +30,7 @@ class LossSettings:
     normal_start: float = 7 / 30  # 2DGS: from 7,000 of 30,000; EnvGS: from 0
     normal_inverse_depth: bool = False  # EnvGS: weight by 1 - (d - p1)/(p99 - p1), clipped, detached
     mono_normal: float = 0.0  # RT-GS 0.01; only where the scene has normals
-    mono_normal_gain: float = (
-        1.0  # its weight is multiplied by it: short presets (docs/lab/reflection.md); 1: published
-    )
+    mono_normal_gain: float = 1.0  # times its weight: short presets (docs/lab/reflection.md); 1: published
     mono_normal_masked: float = 1.0  # times that again in masks of transparent objects (docs/lab/transmittance.md)
     mono_normal_start: float = 0.0  # EnvGS: from 0
     mono_normal_form: MonoNormalForm = "cosine"  # the paper: 1 - n.N; "envgs": |difference|_1 + 1 - cos

@@ -14,10 +14,10 @@ from unittest.mock import patch
 import yaml
 
 from pipelines.planning.graph import build_graph
+from pipelines.planning.inspection import Inspections
 from rtgs.config.locate import choices_of, conf_dir
 from rtgs.config.sweep import ComposedJob, compose_jobs
 from rtgs.methods import find_method
-from rtgs.scenes.once import captures_read_once
 from rtgs.workflow.plan import topological
 
 GOLDEN = Path(__file__).with_name("golden_recipes.json")
@@ -73,28 +73,29 @@ def recipes(method: str) -> Iterator[tuple[str, list[str]]]:
     made in seconds, and its recipe may change.
     """
     paths = ",".join(f"embedded:{scene}" for scene in SCENES)  # as a value, for files are composed once for all three
-    with captures_read_once(), patch("rtgs.pretrained.weights.weight_folders", tuple):  # a machine without networks
+    inspections = Inspections()
+    with patch("rtgs.pretrained.weights.weight_folders", tuple):  # a machine without networks
         for presets, ablations in (("paper", fitting(method)), ("smoke,quick,standard", ["none"])):
             files = [f"method={method}", f"preset={presets}", f"ablation={','.join(ablations)}"]
             for job in _jobs(["scene=ball_statue", *files, f"scene.path={paths}"]):
                 assert job.config is not None
                 assert job.choices is not None
                 scene = job.config.scene.path.split(":")[1]
-                yield f"{scene} {method} {job.choices.preset} {job.choices.ablation}", steps_of(job)
+                yield f"{scene} {method} {job.choices.preset} {job.choices.ablation}", steps_of(job, inspections)
         for words in (words for of, words in OVERRIDES if of == method):
             (job,) = _jobs(["scene=ball_statue", f"method={method}", "preset=smoke", *words.split()])
-            yield f"ball_statue {method} smoke {words}", steps_of(job)
+            yield f"ball_statue {method} smoke {words}", steps_of(job, inspections)
 
 
 def _jobs(words: Sequence[str]) -> tuple[ComposedJob, ...]:
     return compose_jobs(words, multirun=True)[0]
 
 
-def steps_of(job: ComposedJob) -> list[str]:
+def steps_of(job: ComposedJob, inspections: Inspections) -> list[str]:
     """``step fingerprint`` of the steps of a run, upstream first."""
     assert job.config is not None, job.problem
     assert job.choices is not None
-    steps = topological(build_graph(job.config, job.choices).targets)
+    steps = topological(build_graph(job.config, job.choices, inspections).targets)
     return [f"{step.name} {step.fingerprint}" for step in steps if step.name != "report"]
 
 
