@@ -29,8 +29,9 @@ class TrainedRun:
 
     def quality(self) -> dict[str, float | None]:
         """Means over the held-out views: psnr, ssim, and psnr_specular and psnr_diffuse_part where truth is known."""
-        from rtgs.evaluate.evaluate import EvaluationSettings, TimedRender, evaluate_views
+        from rtgs.evaluate.evaluate import TimedRender, evaluate_views
         from rtgs.evaluate.records import RunFacts
+        from rtgs.evaluate.settings import EvaluationSettings
         from rtgs.methods import Mode, RenderOptions
 
         with torch.no_grad():

@@ -11,7 +11,7 @@ import numpy as np
 
 from pipelines.steps.render import RenderTimes, read_timed
 from pipelines.steps.training import last_training, read_summary
-from rtgs.config.schema import EvaluationConfig
+from rtgs.evaluate.settings import EvaluationSettings
 from rtgs.mesh.record import MeshRecord
 from rtgs.workflow import StepContext, StepKind
 
@@ -33,14 +33,14 @@ TRACKED = (  # means over the test views that go to the tracker, where they are 
 class EvaluateParams:
     """What is measured, and the names written beside the numbers."""
 
-    evaluation: EvaluationConfig
+    evaluation: EvaluationSettings
     method: str
     preset: str
 
 
 def evaluate(params: EvaluateParams, context: StepContext) -> None:
     """Write ``metrics.json``, ``metrics.csv`` and ``errors/<stem>.png``; without test views, tables without rows."""
-    from rtgs.evaluate.evaluate import NO_TEST_VIEWS, EvaluationSettings, evaluate_views, write_error_maps
+    from rtgs.evaluate.evaluate import NO_TEST_VIEWS, evaluate_views, write_error_maps
     from rtgs.evaluate.records import RunFacts, write_csv, write_json
     from rtgs.scenes.canonical import read_scene
 
@@ -61,7 +61,7 @@ def evaluate(params: EvaluateParams, context: StepContext) -> None:
     rendered = context.inputs["render"]
     times = RenderTimes.read(rendered)
     renders = [read_timed(rendered, times, view.name, view.camera) for view in scene.test]
-    settings = EvaluationSettings(params.evaluation.lpips, params.evaluation.masked, params.evaluation.eight_bit)
+    settings = params.evaluation
     known = object_facts(context.inputs["extract_mesh"], scene) if "extract_mesh" in context.inputs else None
     table = evaluate_views(renders, scene.test, facts, settings, object_facts=known)
     write_json(context.out / TABLE_JSON, table)

@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 from rtgs.core.refuse import refuse_unknown_words, words_of
 from rtgs.evaluate.publish import OWN_DATA, DataKind
+from rtgs.evaluate.settings import EvaluationSettings
 from rtgs.mesh.settings import MeshSource, ObjectSettings, TsdfSettings
 from rtgs.methods.settings import MethodSettings
 from rtgs.prepare.masks.settings import MaskSettings
@@ -74,15 +75,6 @@ class AblationConfig:
     """One line: what the flipped keys take away and what should be seen."""
     needs: tuple[str, ...] = ()
     """What a method must have for it (:data:`rtgs.methods.spec.FEATURES`); others are refused. Empty: nothing."""
-
-
-@dataclass(frozen=True)
-class EvaluationConfig:
-    """Which groups of metrics are computed (:class:`rtgs.evaluate.evaluate.EvaluationSettings`)."""
-
-    lpips: bool = True
-    masked: bool = True
-    eight_bit: bool = True
 
 
 @dataclass(frozen=True)
@@ -150,7 +142,7 @@ class RunConfig:
     normals: NormalSettings = field(default_factory=NormalSettings)
     method: MethodSettings = field(default_factory=MethodSettings)
     schedule: ScheduleSettings = field(default_factory=ScheduleSettings)
-    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
     mesh: MeshConfig = field(default_factory=MeshConfig)
     ablation: AblationConfig = field(default_factory=AblationConfig)
     table: TableConfig = field(default_factory=TableConfig)

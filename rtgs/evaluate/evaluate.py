@@ -22,6 +22,7 @@ from rtgs.evaluate.records import (
     RunFacts,
     ViewScore,
 )
+from rtgs.evaluate.settings import EvaluationSettings
 from rtgs.evaluate.surface import surface_scores
 from rtgs.pretrained.lpips import InputRange, Lpips, lpips
 from rtgs.pretrained.weights import MissingWeights, WrongWeights
@@ -55,13 +56,7 @@ class TimedRender:
     normal: Tensor | None = None  # (3, H, W) of the first surface, camera frame, any length
 
 
-@dataclass(frozen=True)
-class EvaluationSettings:
-    """Which groups of columns are computed."""
-
-    lpips: bool = True  # both input conventions, when the weights are on this machine
-    masked: bool = True  # inside the mask, for views that have one
-    eight_bit: bool = True  # after rounding to 1/255, the protocol of codes that measure saved PNGs
+EVERYTHING = EvaluationSettings()
 
 
 def load_lpips(settings: EvaluationSettings) -> tuple[Lpips | None, str]:
@@ -78,7 +73,7 @@ def evaluate_views(
     renders: Sequence[TimedRender],
     views: Sequence[PhotoView],
     facts: RunFacts,
-    settings: EvaluationSettings = EvaluationSettings(),
+    settings: EvaluationSettings = EVERYTHING,
     *,
     lpips_model: Lpips | None = None,
     object_facts: ObjectFacts | None = None,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from rtgs.methods.registry import find_method, is_own, method_names, own_methods
 from rtgs.methods.settings import MethodSettings
-from rtgs.methods.spec import MethodSpec, StageSpec
+from rtgs.methods.spec import MethodSpec, Setup, StageSpec
 from rtgs.train.method import (
     LossValue,
     LossValues,
@@ -47,8 +47,9 @@ def create_method(
 
     Raises:
         ValueError: no method has this name, or it cannot use a mesh.
+        TypeError: a method from outside builds something else than a model.
     """
-    from rtgs.methods.model import Setup
+    from rtgs.methods.model import Model
     from rtgs.methods.parts.pixel_bound import bound_by_pixels
 
     spec = find_method(settings.name)
@@ -57,7 +58,10 @@ def create_method(
     pixels = max((view.camera.width * view.camera.height for view in scene.train), default=0)
     settings, lowered = bound_by_pixels(settings, pixels)
     stages = spec.timeline(settings, schedule, transparent=object_mesh is not None)
-    return spec.build(Setup(spec, settings, scene, schedule, generator, object_mesh, stages, lowered))
+    made = spec.build(Setup(spec, settings, scene, schedule, generator, object_mesh, stages, lowered))
+    if not isinstance(made, Model):
+        raise TypeError(f"method {spec.name} was built as a {type(made).__name__}, not as a rtgs.methods.model.Model")
+    return made
 
 
 __all__ = [
@@ -69,6 +73,7 @@ __all__ = [
     "Observation",
     "RenderOptions",
     "RenderedView",
+    "Setup",
     "SpecularLayers",
     "Stage",
     "StageSpec",

@@ -11,7 +11,8 @@ from rtgs.methods.family import DIFFUSE
 from rtgs.methods.spec import SURFACE, MethodSpec
 
 if TYPE_CHECKING:
-    from rtgs.methods.model import Model, Setup
+    from rtgs.methods.model import Model
+    from rtgs.methods.spec import Setup
 
 
 def build(setup: Setup) -> Model:

@@ -33,7 +33,7 @@ from rtgs.train.settings import LossSettings
 from rtgs.train.terms import LossTerm, term_start
 
 if TYPE_CHECKING:
-    from rtgs.methods.model import Setup
+    from rtgs.methods.spec import Setup
     from rtgs.scenes.scene import View
 
 Terms = Sequence[LossTerm | Decision]

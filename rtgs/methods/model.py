@@ -7,10 +7,8 @@ the method they are in; the model asks them in order.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-import torch
 from torch import Tensor
 
 from rtgs.core.cameras import Camera
@@ -18,6 +16,7 @@ from rtgs.core.decisions import Decision
 from rtgs.methods.parts.base import BaseSet
 from rtgs.methods.parts.gaussian_set import GaussianSet
 from rtgs.methods.parts.part import Frame, Part, Raster
+from rtgs.methods.spec import Setup
 from rtgs.train.method import (
     LossValues,
     Mode,
@@ -31,35 +30,10 @@ from rtgs.train.parameters import ParameterGroup
 from rtgs.train.terms import LossTerm, table_of
 
 if TYPE_CHECKING:
-    from rtgs.mesh.container import ObjectMesh
     from rtgs.methods.settings import MethodSettings
-    from rtgs.methods.spec import MethodSpec
-    from rtgs.scenes.scene import Scene, View
-    from rtgs.train.settings import ScheduleSettings
+    from rtgs.scenes.scene import View
 
 NO_OPTIONS = RenderOptions()
-
-
-@dataclass(frozen=True)
-class Setup:
-    """What a method is composed from.
-
-    Attributes:
-        settings: with caps as this scene's pictures bound them.
-        generator: drawn from at initialisation, in training views and by density control; it travels in checkpoints.
-        object_mesh: of the scene's transparent object, for methods with a stage that needs it; None: without it.
-        stages: of this run.
-        decisions: what was lowered in the settings.
-    """
-
-    spec: MethodSpec
-    settings: MethodSettings
-    scene: Scene
-    schedule: ScheduleSettings
-    generator: torch.Generator
-    object_mesh: ObjectMesh | None = None
-    stages: tuple[Stage, ...] = ()
-    decisions: tuple[Decision, ...] = field(default=())
 
 
 class Model:

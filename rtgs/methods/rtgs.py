@@ -11,7 +11,8 @@ from rtgs.methods.family import DIFFUSE, REFLECTION, TRANSMITTANCE
 from rtgs.methods.spec import GLASS, MICROFACET, MIRROR, SURFACE, MethodSpec
 
 if TYPE_CHECKING:
-    from rtgs.methods.model import Model, Setup
+    from rtgs.methods.model import Model
+    from rtgs.methods.spec import Setup
 
 
 def build(setup: Setup) -> Model:

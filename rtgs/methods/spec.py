@@ -10,11 +10,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from rtgs.train.method import Stage
+from rtgs.core.decisions import Decision
+from rtgs.train.method import Method, Stage
 
 if TYPE_CHECKING:
-    from rtgs.methods.model import Model, Setup
+    import torch
+
+    from rtgs.mesh.container import ObjectMesh
     from rtgs.methods.settings import MethodSettings
+    from rtgs.scenes.scene import Scene
     from rtgs.train.settings import ScheduleSettings
 
 SURFACE = "surface"  # Gaussians with a normal and a depth: losses on surfaces, meshes
@@ -66,20 +70,42 @@ class StageSpec:
 
 
 @dataclass(frozen=True)
+class Setup:
+    """What a method is composed from.
+
+    Attributes:
+        settings: with caps as this scene's pictures bound them.
+        generator: drawn from at initialisation, in training views and by density control; it travels in checkpoints.
+        object_mesh: of the scene's transparent object, for methods with a stage that needs it; None: without it.
+        stages: of this run.
+        decisions: what was lowered in the settings.
+    """
+
+    spec: MethodSpec
+    settings: MethodSettings
+    scene: Scene
+    schedule: ScheduleSettings
+    generator: torch.Generator
+    object_mesh: ObjectMesh | None = None
+    stages: tuple[Stage, ...] = ()
+    decisions: tuple[Decision, ...] = ()
+
+
+@dataclass(frozen=True)
 class MethodSpec:
     """A method.
 
     Attributes:
         name: as in ``method.name`` and in tables.
         stages: in order; the first starts at step 0.
-        build: composes what trains from a :class:`rtgs.methods.model.Setup`. It imports torch, and is called when
+        build: composes what trains from a :class:`Setup`. It imports torch, and is called when
             something trains or renders.
         has: which of :data:`FEATURES` it has. Ablations say what they take away, and are refused by methods without it.
     """
 
     name: str
     stages: tuple[StageSpec, ...]
-    build: Callable[[Setup], Model]
+    build: Callable[[Setup], Method]
     has: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:

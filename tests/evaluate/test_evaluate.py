@@ -12,10 +12,11 @@ import torch
 from PIL import Image
 
 from rtgs.core.errors import RtgsError
-from rtgs.evaluate.evaluate import NO_TEST_VIEWS, EvaluationSettings, TimedRender, evaluate_views, write_error_maps
+from rtgs.evaluate.evaluate import NO_TEST_VIEWS, TimedRender, evaluate_views, write_error_maps
 from rtgs.evaluate.images import colorize, error_map
 from rtgs.evaluate.metrics import psnr, ssim
 from rtgs.evaluate.records import METRICS, RunFacts, read_json, write_csv, write_json
+from rtgs.evaluate.settings import EvaluationSettings
 from rtgs.evaluate.tables import PAPER_SCORES, summarize
 from rtgs.pretrained import weights as pretrained
 

@@ -9,10 +9,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from rtgs.evaluate.evaluate import EvaluationSettings, TimedRender, evaluate_views
+from rtgs.evaluate.evaluate import TimedRender, evaluate_views
 from rtgs.evaluate.layers import encoded, layer_scales, layer_scores
 from rtgs.evaluate.metrics import psnr
 from rtgs.evaluate.records import LAYER_METRICS, RunFacts, read_json, write_json
+from rtgs.evaluate.settings import EvaluationSettings
 
 QUICK = EvaluationSettings(lpips=False, masked=False, eight_bit=False)
 FACTS = RunFacts("spheres", "rtgs")

@@ -17,9 +17,10 @@ from torch import Tensor
 
 from pipelines.steps.evaluate import object_facts
 from pipelines.steps.report import _guide
-from rtgs.evaluate.evaluate import EvaluationSettings, TimedRender, evaluate_views
+from rtgs.evaluate.evaluate import TimedRender, evaluate_views
 from rtgs.evaluate.publish import Measured, TableSpec, build_table
 from rtgs.evaluate.records import SURFACE_METRICS, EvaluationTable, ObjectFacts, RunFacts, read_json, write_json
+from rtgs.evaluate.settings import EvaluationSettings
 from rtgs.evaluate.surface import hit_shares, surface_scores
 from rtgs.evaluate.table_formats import comma_separated, markdown
 from rtgs.mesh.container import ObjectMesh, write_object_mesh

@@ -30,7 +30,7 @@ from rtgs.train.schedule import (
 from rtgs.train.settings import ScheduleSettings
 
 if TYPE_CHECKING:
-    from rtgs.methods.model import Setup
+    from rtgs.methods.spec import Setup
 
 
 class BaseRules(Protocol):

@@ -39,7 +39,7 @@ from rtgs.train.schedule import (
 )
 
 if TYPE_CHECKING:
-    from rtgs.methods.model import Setup
+    from rtgs.methods.spec import Setup
     from rtgs.scenes.scene import View
 
 _BEGUN = "third_stage"  # in the state: the stage has begun

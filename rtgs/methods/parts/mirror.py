@@ -53,7 +53,7 @@ from rtgs.train.schedule import densify_ahead, densify_due, opacity_was_reset, s
 from rtgs.train.settings import ScheduleSettings
 
 if TYPE_CHECKING:
-    from rtgs.methods.model import Setup
+    from rtgs.methods.spec import Setup
     from rtgs.scenes.scene import View
 
 

@@ -15,9 +15,10 @@ from benchmarks.quality import picture
 from pipelines.publishing.results import RUN_FILE
 from pipelines.steps.evaluate import TABLE_JSON
 from rtgs.core.errors import RtgsError
-from rtgs.evaluate.evaluate import EvaluationSettings, TimedRender, evaluate_views
+from rtgs.evaluate.evaluate import TimedRender, evaluate_views
 from rtgs.evaluate.images import file_stem
 from rtgs.evaluate.records import RunFacts, write_json
+from rtgs.evaluate.settings import EvaluationSettings
 from rtgs.scenes.canonical import save_scene
 from rtgs.scenes.scene import load_scene
 from rtgs.scenes.settings import SceneSettings

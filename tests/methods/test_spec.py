@@ -1,0 +1,83 @@
+"""A method as a value: timelines of stages, what stages read, features."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import pytest
+
+from rtgs.methods import MethodSpec, StageSpec, find_method, is_own, method_names, own_methods
+from rtgs.methods.family import DIFFUSE, REFLECTION, TRANSMITTANCE
+from rtgs.methods.settings import MethodSettings, ReflectionSettings, TransmittanceSettings
+from rtgs.train.settings import ScheduleSettings
+
+PLAN = ScheduleSettings(total=100)
+
+
+def unbuilt(setup):
+    raise AssertionError("a plan composes no model")
+
+
+def settings(start: float, third: float = 0.6, enabled: bool = True) -> MethodSettings:
+    return MethodSettings(
+        name="rtgs",
+        reflection=ReflectionSettings(start=start),
+        transmittance=TransmittanceSettings(start=third, enabled=enabled),
+    )
+
+
+def stages(chosen: MethodSettings, *, transparent: bool) -> list[tuple[str, int, int]]:
+    found = find_method("rtgs").timeline(chosen, PLAN, transparent=transparent)
+    return [(stage.name, stage.from_step, stage.until) for stage in found]
+
+
+def test_a_timeline_has_the_stages_that_the_run_gets():
+    whole = [("diffuse", 0, 30), ("reflection", 30, 60), ("transmittance", 60, 100)]
+    assert stages(settings(0.3), transparent=True) == whole
+    two = [("diffuse", 0, 30), ("reflection", 30, 100)]
+    assert stages(settings(0.3), transparent=False) == two
+    assert stages(settings(0.3, enabled=False), transparent=True) == two
+    assert stages(settings(1.0), transparent=True) == [("diffuse", 0, 100)]
+    assert stages(settings(0.3, third=1.0), transparent=True) == two
+    assert stages(settings(0.0), transparent=False) == [("reflection", 0, 100)]
+
+
+def test_a_stage_before_its_turn_is_refused_with_both_keys():
+    with pytest.raises(
+        ValueError, match=r"transmittance\.start=0\.2 is step 20 of 100.*method\.reflection\.start=0\.3"
+    ):
+        stages(settings(0.3, third=0.2), transparent=True)
+
+
+def test_what_a_method_declares_is_checked():
+    with pytest.raises(ValueError, match="its first stage must start at once"):
+        MethodSpec("late", (REFLECTION,), unbuilt)
+    with pytest.raises(ValueError, match="two stages of one name: diffuse, diffuse"):
+        MethodSpec("twice", (DIFFUSE, replace(DIFFUSE, reads=lambda settings: settings)), unbuilt)
+    with pytest.raises(ValueError, match="has fog: known are surface, mirror, microfacet, glass"):
+        MethodSpec("foggy", (DIFFUSE,), unbuilt, frozenset({"fog"}))
+    with pytest.raises(ValueError, match="method 2dgs has no stage 'reflection': it has diffuse"):
+        find_method("2dgs").stage("reflection")
+
+
+def test_a_method_of_one_stage_may_read_all_its_settings():
+    """Materials in a single stage train with the numbers they are given."""
+    spec = MethodSpec("deferred", (StageSpec("deferred"),), unbuilt)
+    chosen = replace(MethodSettings(), materials=replace(MethodSettings().materials, specular=0.3))
+    assert spec.stage("deferred").reads(chosen) == chosen
+    assert DIFFUSE.reads(chosen) == DIFFUSE.reads(MethodSettings())
+
+
+def test_the_methods_of_this_package():
+    assert method_names()[:4] == ("2dgs", "3dgs", "envgs", "rtgs")
+    assert all(is_own(spec) for spec in own_methods())
+    assert [spec.object_stage(settings(0.3)) for spec in own_methods()] == [None, None, None, TRANSMITTANCE]
+    assert find_method("rtgs").object_stage(settings(0.3, enabled=False)) is None
+
+
+def test_methods_are_found_without_torch():
+    code = "import sys, rtgs.methods as m; m.find_method('rtgs'); print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
