@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from rtgs.methods import MethodSpec
@@ -24,7 +24,7 @@ def build(setup: Setup) -> Model:
     from rtgs.methods.parts.kinds import SURFELS
     from rtgs.methods.parts.part import Frame, Part, Raster
     from rtgs.methods.shading.diffuse import diffuse
-    from rtgs.train.method import Observation, RenderedView
+    from rtgs.train.method import RenderedView
     from rtgs.train.parameters import ParameterGroup, Rate
     from rtgs.train.terms import LossTerm
 
@@ -44,9 +44,6 @@ def build(setup: Setup) -> Model:
         def shade(self, frame: Frame, raster: Raster) -> RenderedView:
             image = self.group["gain"][:, None, None] * diffuse(raster.buffers)
             return RenderedView(frame.camera, image, raster.buffers, observations=raster.observations)
-
-        def step(self, step: int, observations: Mapping[str, Observation]) -> None:
-            self.group.step(step)
 
     exposure = Exposure()
 

@@ -12,7 +12,7 @@ from pipelines.steps.extract_mesh import why_absent
 from pipelines.steps.training import StageParams, last_training, load_method, train_stage
 from rtgs.methods import MethodSpec, StageSpec, find_method, is_own, own_methods
 from rtgs.workflow import Step, StepContext, StepKind
-from rtgs.workflow.fingerprint import file_digest
+from rtgs.workflow.fingerprint import file_digest, fingerprint
 
 if TYPE_CHECKING:
     from rtgs.evaluate.boundary import BoundaryScores
@@ -62,7 +62,7 @@ def _train_with_object(params: StageParams, context: StepContext) -> None:
 def _without_object(params: StageParams) -> StageParams:
     """Those of the stage before, lasting as long as the whole run; it is met on its way, at ``params.from_step``."""
     spec = find_method(params.method.name)
-    before = spec.timeline(params.method, params.schedule)[-1]
+    before = spec.before(params.stage, params.method, params.schedule)
     own = spec.stage(before.name).reads(params.method)
     return replace(params, method=own, stage=before.name, from_step=before.from_step)
 
@@ -92,8 +92,11 @@ def train_step(
 
 
 def _source_digest(spec: MethodSpec) -> str:
-    """SHA-256 of the file that composes the method."""
-    return file_digest(Path(inspect.getfile(spec.build)))
+    """SHA-256 over the files of the method's functions: what composes it, when its stages start, what they read."""
+    functions = [spec.build, *(each for stage in spec.stages for each in (stage.start, stage.reads, stage.on))]
+    files = {inspect.getsourcefile(inspect.unwrap(getattr(each, "func", each))) for each in functions}
+    own = sorted(file for file in files if file is not None)
+    return fingerprint([file_digest(Path(file)) for file in own])
 
 
 def training_kinds(specs: Iterable[MethodSpec] | None = None) -> tuple[StepKind, ...]:

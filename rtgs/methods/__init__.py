@@ -54,7 +54,7 @@ def create_method(
 
     spec = find_method(settings.name)
     if object_mesh is not None and spec.object_stage(settings) is None:
-        raise ValueError(f"method {spec.name} has no stage that takes an object mesh; method=rtgs has")
+        raise ValueError(f"method {spec.name} has no stage that takes an object mesh, or it is switched off")
     pixels = max((view.camera.width * view.camera.height for view in scene.train), default=0)
     settings, lowered = bound_by_pixels(settings, pixels)
     stages = spec.timeline(settings, schedule, transparent=object_mesh is not None)

@@ -71,6 +71,7 @@ def surface_terms(setup: Setup) -> Terms:
         assert rendered.buffers.distortion is not None
         return distortion_loss(rendered.buffers.distortion)
 
+    mono_weight = loss.mono_normal * loss.mono_normal_gain
     both = RenderOptions(depth=ratio < 1, median_depth=ratio > 0, normal=True)
     normals = RenderOptions(depth=loss.normal_inverse_depth, normal=True)
     found: list[LossTerm | Decision] = []
@@ -78,8 +79,8 @@ def surface_terms(setup: Setup) -> Terms:
         ("normal", start("normal consistency", loss.normal, loss.normal_start), (loss.normal, consistency, both)),
         (
             "mono_normal",
-            _mono_start(setup, start("monocular normal", loss.mono_normal, loss.mono_normal_start), found),
-            (loss.mono_normal * loss.mono_normal_gain, mono, normals),
+            _mono_start(setup, start("monocular normal", mono_weight, loss.mono_normal_start), found),
+            (mono_weight, mono, normals),
         ),
         (
             "distortion",

@@ -52,6 +52,9 @@ class Model:
         self.generator = setup.generator
         self.extent = setup.scene.extent
         self.parts = {part.name: part for part in parts}
+        if len(self.parts) < len(parts):
+            names = ", ".join(part.name for part in parts)
+            raise ValueError(f"method {setup.spec.name} has two parts of one name: {names}")
         self.base = first
         found = tuple(terms)
         self.loss = table_of(setup.settings.loss, (term for term in found if isinstance(term, LossTerm)))
@@ -147,6 +150,8 @@ class Model:
         seen = {each.set_name: each for each in observations}
         for part in self.parts.values():
             part.step(step, seen)
+            for group in part.groups:
+                group.step(step)
         return tuple(self._between(step + 1))
 
     def _between(self, following: int) -> Iterator[StepEvent]:
@@ -161,7 +166,10 @@ class Model:
         """Flat mapping of every tensor that training needs to go on, generator included."""
         tensors = {"generator": self.generator.get_state()}
         for each in (*self.sets, *self.groups, *self.parts.values()):
-            tensors.update(each.state())
+            more = each.state()
+            if twice := sorted(tensors.keys() & more.keys()):
+                raise ValueError(f"two sets, groups or parts of method {self.name} write {twice[0]} into a checkpoint")
+            tensors.update(more)
         return tensors
 
     def load(self, state: dict[str, Tensor]) -> None:

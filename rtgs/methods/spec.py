@@ -109,8 +109,13 @@ class MethodSpec:
     has: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
-        if not self.stages or self.stages[0].start is not at_once:
-            raise ValueError(f"method {self.name!r}: its first stage must start at once (step 0)")
+        first = self.stages[0] if self.stages else None
+        if first is None or first.start is not at_once or first.on is not always or first.needs_object:
+            raise ValueError(f"method {self.name!r}: its first stage must start at once, in every scene (step 0)")
+        if keyless := [stage.name for stage in self.stages[1:] if not stage.start_key]:
+            raise ValueError(
+                f"method {self.name!r}: stage {keyless[0]} does not say which key its start is (start_key)"
+            )
         names = [stage.name for stage in self.stages]
         if len(set(names)) < len(names):
             raise ValueError(f"method {self.name!r} has two stages of one name: {', '.join(names)}")
@@ -132,6 +137,12 @@ class MethodSpec:
     def object_stage(self, settings: MethodSettings) -> StageSpec | None:
         """The stage that needs a transparent object's mesh, where the settings ask for it."""
         return next((stage for stage in self.stages if stage.needs_object and stage.on(settings)), None)
+
+    def before(self, name: str, settings: MethodSettings, schedule: ScheduleSettings) -> Stage:
+        """The stage that goes on to the end of a run where the stage ``name`` turns out to have no object."""
+        order = [stage.name for stage in self.stages]
+        earlier = order[: order.index(name)]
+        return [stage for stage in self.timeline(settings, schedule) if stage.name in earlier][-1]
 
     def timeline(
         self, settings: MethodSettings, schedule: ScheduleSettings, *, transparent: bool = False

@@ -26,6 +26,7 @@ class BadSurfels:
     count: int
     ids: tuple[int, ...]  # the first few
     values: tuple[str, ...]  # theirs, as text
+    unit: str = "surfel"  # what a row is; of a group of other parameters "row"
 
 
 @dataclass(frozen=True)
@@ -52,8 +53,10 @@ class TrainingDiverged(RtgsError):
             lines.append(divergence.cause)
         lines.append("terms: " + ", ".join(f"{name} {value:.6g}" for name, value in divergence.terms))
         for bad in divergence.surfels:
-            examples = "; ".join(f"surfel {index}: {value}" for index, value in zip(bad.ids, bad.values, strict=True))
-            lines.append(f"set {bad.set_name}, {bad.tensor}: {bad.count} surfels not finite ({examples})")
+            examples = "; ".join(
+                f"{bad.unit} {index}: {value}" for index, value in zip(bad.ids, bad.values, strict=True)
+            )
+            lines.append(f"set {bad.set_name}, {bad.tensor}: {bad.count} {bad.unit}s not finite ({examples})")
         lines.append(
             "The last checkpoint is intact and holds finite values. Lower the learning rates in method.optimizer or "
             "switch the named term off (its weight in method.loss) and run again; if the inputs are ordinary photos, "
@@ -85,16 +88,17 @@ def diverged(terms: LossValues, method: Method, step: int, view: str, *, cause: 
 def _bad_surfels(method: Method) -> tuple[BadSurfels, ...]:
     """Every parameter and gradient with non-finite rows."""
     found = []
-    for part in (*method.sets, *method.groups):
+    parts = (*((each, "surfel") for each in method.sets), *((each, "row") for each in method.groups))
+    for part, unit in parts:
         for name, tensor in part.tensors():
             for label, values in ((name, tensor.detach()), (f"gradient of {name}", tensor.grad)):
-                bad = _describe(part, label, values)
+                bad = _describe(part, unit, label, values)
                 if bad is not None:
                     found.append(bad)
     return tuple(found)
 
 
-def _describe(part: Trained, label: str, values: Tensor | None) -> BadSurfels | None:
+def _describe(part: Trained, unit: str, label: str, values: Tensor | None) -> BadSurfels | None:
     if values is None:
         return None
     rows = values.reshape(len(values) if values.ndim else 1, -1)
@@ -103,4 +107,4 @@ def _describe(part: Trained, label: str, values: Tensor | None) -> BadSurfels | 
         return None
     first = ids[:SHOWN].tolist()
     texts = tuple(", ".join(f"{value:.4g}" for value in rows[index, :4].tolist()) for index in first)
-    return BadSurfels(part.name, label, len(ids), tuple(first), texts)
+    return BadSurfels(part.name, label, len(ids), tuple(first), texts, unit)

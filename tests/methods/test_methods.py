@@ -10,13 +10,16 @@ from training_cases import HEIGHT, WIDTH, small_method, small_scene, small_sched
 
 from rtgs.core.errors import RtgsError
 from rtgs.gaussians.settings import DensitySettings
-from rtgs.methods import Mode, RenderOptions, Stage, create_method, find_method, method_names
+from rtgs.methods import Mode, RenderOptions, Setup, Stage, create_method, find_method, method_names
 from rtgs.methods import losses as method_losses
+from rtgs.methods.model import Model
 from rtgs.methods.parts import kinds as module
+from rtgs.methods.parts.part import Part
 from rtgs.methods.settings import MethodSettings
 from rtgs.render.buffers import RasterOptions
 from rtgs.render.settings import RenderSettings
 from rtgs.train import losses
+from rtgs.train.parameters import ParameterGroup, Rate
 from rtgs.train.seeds import generator_for
 from rtgs.train.settings import LossSettings
 
@@ -248,3 +251,25 @@ def test_a_state_of_another_method_is_refused():
     state = {name.replace("base.", "other."): tensor for name, tensor in method.state().items()}
     with pytest.raises(ValueError, match=r"no base\.surfels\.means"):
         method.load(state)
+
+
+def test_a_gain_of_zero_leaves_a_term_out():
+    settings = replace(small_method(), loss=LossSettings(normal=0.0, mono_normal=0.01, mono_normal_gain=0.0))
+    method, scene = make(settings, normals=True)
+    terms, _ = train_step(method, scene, 59)
+    assert [term.name for term in terms.terms] == ["l1", "dssim"]
+    assert "no monocular normal loss" in {decision.what for decision in method.decisions}
+
+
+def test_names_of_parts_and_of_what_they_save_are_their_own():
+    method, scene = make()
+    setup = Setup(find_method("2dgs"), method.settings, scene, method.schedule, method.generator)
+    with pytest.raises(ValueError, match="two parts of one name: base, base"):
+        Model(setup, (method.base, method.base))
+
+    class Second(Part):
+        name = "second"
+        groups = (ParameterGroup("base", {"gain": torch.ones(1)}, Rate(0.1)),)
+
+    with pytest.raises(ValueError, match=r"two sets, groups or parts of method 2dgs write base\.adam\.steps"):
+        Model(setup, (method.base, Second())).state()

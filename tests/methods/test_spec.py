@@ -54,8 +54,12 @@ def test_a_stage_before_its_turn_is_refused_with_both_keys():
 def test_what_a_method_declares_is_checked():
     with pytest.raises(ValueError, match="its first stage must start at once"):
         MethodSpec("late", (REFLECTION,), unbuilt)
+    with pytest.raises(ValueError, match="its first stage must start at once, in every scene"):
+        MethodSpec("sometimes", (replace(DIFFUSE, needs_object=True),), unbuilt)
+    with pytest.raises(ValueError, match="stage reflection names no start_key"):
+        MethodSpec("keyless", (DIFFUSE, replace(REFLECTION, start_key="")), unbuilt)
     with pytest.raises(ValueError, match="two stages of one name: diffuse, diffuse"):
-        MethodSpec("twice", (DIFFUSE, replace(DIFFUSE, reads=lambda settings: settings)), unbuilt)
+        MethodSpec("twice", (DIFFUSE, replace(DIFFUSE, start_key="method.a")), unbuilt)
     with pytest.raises(ValueError, match="has fog: known are surface, mirror, microfacet, glass"):
         MethodSpec("foggy", (DIFFUSE,), unbuilt, frozenset({"fog"}))
     with pytest.raises(ValueError, match="method 2dgs has no stage 'reflection': it has diffuse"):
@@ -81,3 +85,10 @@ def test_methods_are_found_without_torch():
     code = "import sys, rtgs.methods as m; m.find_method('rtgs'); print('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
+
+
+def test_where_there_is_no_object_the_stage_before_goes_on():
+    spec = find_method("rtgs")
+    before = spec.before("transmittance", settings(0.3), PLAN)
+    assert (before.name, before.from_step, before.until) == ("reflection", 30, 100)
+    assert spec.before("transmittance", settings(1.0), PLAN).name == "diffuse"

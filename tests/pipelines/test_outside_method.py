@@ -91,7 +91,7 @@ def test_a_bad_gradient_of_its_group_stops_training_and_is_named(on_path):
     (group,) = broken.method.groups
     assert isinstance(group, ParameterGroup)
     group["gain"].register_hook(lambda gradient: torch.full_like(gradient, float("nan")))
-    with pytest.raises(TrainingDiverged, match=r"set exposure, gradient of gain: 3 .* not finite"):
+    with pytest.raises(TrainingDiverged, match=r"set exposure, gradient of gain: 3 rows not finite"):
         broken.run()
 
 

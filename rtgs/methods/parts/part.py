@@ -88,7 +88,8 @@ class Part:
         return None
 
     def step(self, step: int, observations: Mapping[str, Observation]) -> None:
-        """Adam after the backward pass; ``observations`` of the view by the name of the set."""
+        """Adam on the sets after the backward pass; ``observations`` of the view by the name of the set. The model
+        steps the groups."""
 
     def judge(self, following: int) -> Iterable[StepEvent]:
         """Whether the part goes on, before anything changes ahead of step ``following``."""
