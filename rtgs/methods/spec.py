@@ -114,7 +114,7 @@ class MethodSpec:
             raise ValueError(f"method {self.name!r}: its first stage must start at once, in every scene (step 0)")
         if keyless := [stage.name for stage in self.stages[1:] if not stage.start_key]:
             raise ValueError(
-                f"method {self.name!r}: stage {keyless[0]} does not say which key its start is (start_key)"
+                f"method {self.name!r}: stage {keyless[0]} names no start_key, the key its start reads"
             )
         names = [stage.name for stage in self.stages]
         if len(set(names)) < len(names):
