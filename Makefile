@@ -30,7 +30,7 @@ WORKER_WORDS = $(if $(findstring hydra/launcher=,$(RUN)),,hydra.launcher.workers
 TABLE = $(BIN)/rtgs run preset=$(PRESET) $(SEED_LIST) $(WORKER_WORDS) $(DATA_WORDS)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test e2e bench lint format dashboard accept-steps contact-sheet clean
+.PHONY: help setup demo test e2e bench lint format docs dashboard accept-steps contact-sheet clean
 .PHONY: reproduce-table1 reproduce-table2 reproduce-table3 reproduce-fig-split-sum
 
 help: ## list the targets
@@ -91,6 +91,9 @@ lint: setup ## ruff and pyright
 format: setup ## let ruff put things right
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+docs: setup ## docs/api.md: the reference of what rtgs exports, from its docstrings
+	$(BIN)/python docs/make_api.py
 
 dashboard: setup ## browse the runs in MLflow on this machine (loopback)
 	$(BIN)/rtgs dashboard

@@ -25,9 +25,25 @@ class Rays:
 class Camera:
     """A pinhole camera without distortion (importers undistort).
 
-    ``rotation`` (3, 3) and ``translation`` (3,) are float64 and map world to camera: x_cam = R x + t. Focal lengths and
-    principal point are in pixels of a ``width`` x ``height`` image; fx != fy and an off-centre principal point are
-    legal.
+    Parameters
+    ----------
+    rotation : (3, 3) Tensor
+        Float64, world to camera: x_cam = R x + t.
+    translation : (3,) Tensor
+        t of the same, float64.
+    fx, fy : float
+        Focal lengths in pixels of the image; they may differ.
+    cx, cy : float
+        Principal point in pixels of the image; it may be off the centre.
+    width, height : int
+        Size of the image in pixels.
+    name : str, optional
+        For messages.
+
+    Raises
+    ------
+    ValueError
+        A shape is wrong, or a number is not finite or not positive.
     """
 
     rotation: Tensor

@@ -31,12 +31,38 @@ def error_map(image: Tensor, target: Tensor, full_scale: float = ERROR_FULL_SCAL
 
 
 def to_bytes(image: Tensor) -> np.ndarray:
-    """(3, H, W) in [0, 1] to (H, W, 3) uint8, clamped and rounded."""
+    """Colours as bytes, clamped and rounded.
+
+    Parameters
+    ----------
+    image : (3, H, W) Tensor
+        In [0, 1].
+
+    Returns
+    -------
+    (H, W, 3) ndarray of uint8
+        For :func:`write_png`.
+    """
     return (image.detach().clamp(0, 1) * 255).round().to(torch.uint8).permute(1, 2, 0).contiguous().numpy()
 
 
 def write_png(path: Path, pixels: np.ndarray, note: str = "") -> None:
-    """Write (H, W, 3) or (H, W) uint8; ``note`` becomes the PNG's description (the colour scale, for example)."""
+    """Write a PNG file. Folders that are missing are made.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    pixels : (H, W, 3) or (H, W) ndarray of uint8
+        Colours, or grey values.
+    note : str, optional
+        Becomes the PNG's description (the colour scale, for example).
+
+    Raises
+    ------
+    TypeError
+        The pixels are not uint8.
+    """
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo
 

@@ -16,9 +16,32 @@ MSE_FLOOR = 1e-10  # EnvGS and 3DGS-family codes; identical images give 100 dB i
 
 
 def psnr(image: Tensor, target: Tensor, *, mask: Tensor | None = None) -> float:
-    """Peak signal-to-noise ratio in dB over all channels and pixels, or over the pixels of ``mask`` (H, W) bool.
+    """Peak signal-to-noise ratio: -10 log10(max(MSE, 1e-10)), at most 100 dB.
 
-    -10 log10(max(MSE, 1e-10)): at most 100 dB.
+    Parameters
+    ----------
+    image : (3, H, W) Tensor
+        The render; it is clamped to [0, 1].
+    target : (3, H, W) Tensor
+        The photo, in [0, 1].
+    mask : (H, W) bool Tensor, optional
+        The pixels that count; None: all.
+
+    Returns
+    -------
+    float
+        In dB, over all channels of the pixels.
+
+    Raises
+    ------
+    TypeError
+        A tensor does not hold floating-point numbers.
+    ValueError
+        Shapes or ranges do not fit, a value is not finite, or the mask is empty.
+
+    References
+    ----------
+    .. [1] method.md 9
     """
     image, target = checked_pair(image, target)
     squared = (image - target).square().mean(0)

@@ -18,14 +18,26 @@ from rtgs.native import core
 def activate_surfels(surfels: Gaussians, camera_center: Tensor, sh_degree: int) -> ActivatedSurfels:
     """Activate for one camera, float32, differentiable by every raw parameter.
 
-    Args:
-        surfels: N surfels (two scales) or ellipsoids (three), float32 on the CPU.
-        camera_center: (3,) world; a constant (it gets no gradient).
-        sh_degree: active degree; capped by what the surfels hold.
+    Parameters
+    ----------
+    surfels : Surfels or Ellipsoids
+        N of them, float32 on the CPU.
+    camera_center : (3,) Tensor
+        World; a constant (it gets no gradient).
+    sh_degree : int
+        Active degree of the spherical harmonics; capped by what the surfels hold.
 
-    Raises:
-        TypeError: a parameter is not float32 on the CPU.
-        ValueError: shapes do not match.
+    Returns
+    -------
+    ActivatedSurfels
+        What the renderers take.
+
+    Raises
+    ------
+    TypeError
+        A parameter is not float32 on the CPU.
+    ValueError
+        Shapes do not match.
     """
     for name in PARAMETERS:  # not the channels
         tensor = surfels[name]

@@ -49,20 +49,38 @@ def gaussians_from_points(
     Points with a NaN or inf coordinate are left out. With ``settings.random_points`` > 0 the points are replaced by
     that many uniform random ones of random colour in ``box``, or else in the box of the points.
 
-    Args:
-        kind: ``Surfels`` or ``Ellipsoids``.
-        points: (P, 3) world.
-        colors: (P, 3) in 0..1.
-        generator: draws the orientations (and the random points).
-        box: (2, 3) lowest and highest corner, world; only for random points.
-        channels: what the Gaussians hold besides, at their initial values.
+    Parameters
+    ----------
+    kind : type
+        ``Surfels`` or ``Ellipsoids``.
+    points : (P, 3) Tensor
+        World.
+    colors : (P, 3) Tensor
+        In 0..1.
+    settings : InitSettings
+        Opacity, size and orientation to start with.
+    generator : torch.Generator
+        Draws the orientations (and the random points).
+    box : (2, 3) Tensor, optional
+        Lowest and highest corner, world; only for random points.
+    channels : tuple of Channel, optional
+        What the Gaussians hold besides, at their initial values.
 
-    Returns:
-        Gaussians that require gradients, float32.
+    Returns
+    -------
+    Surfels or Ellipsoids
+        Float32; they require gradients.
 
-    Raises:
-        RtgsError: there are fewer usable points than ``settings.min_points``.
-        ValueError: shapes do not match.
+    Raises
+    ------
+    RtgsError
+        There are fewer usable points than ``settings.min_points``.
+    ValueError
+        Shapes do not match.
+
+    References
+    ----------
+    .. [1] method.md 2
     """
     if points.ndim != 2 or points.shape[1] != 3 or colors.shape != points.shape:
         raise ValueError(f"points and colors must both be (P, 3), got {tuple(points.shape)} and {tuple(colors.shape)}")

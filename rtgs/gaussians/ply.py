@@ -37,12 +37,20 @@ def write_ply(path: str | Path, gaussians: Gaussians, third_scale: bool = True) 
 
     Ellipsoids have their three scales and normals of 0, as 3DGS writes them.
 
-    Args:
-        third_scale: of surfels: add the constant scale_2 = log(1e-6) that viewers of 3D Gaussians need; without it the
-            file is the native two-scale one. :func:`read_gaussians` takes all of them and gives back the same bits.
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+    gaussians : Surfels or Ellipsoids
+        With their channels.
+    third_scale : bool, optional
+        Of surfels: add the constant scale_2 = log(1e-6) that viewers of 3D Gaussians need; without it the file is the
+        native two-scale one. :func:`read_gaussians` takes all of them and gives back the same bits.
 
-    Raises:
-        ValueError: a value is NaN or inf, or a channel has the name of another property.
+    Raises
+    ------
+    ValueError
+        A value is NaN or inf, or a channel has the name of another property.
     """
     path = Path(path)
     values = {name: tensor.detach() for name, tensor in gaussians.items()}
@@ -108,18 +116,28 @@ def read_gaussians(
 
     Properties may come in any order; those without a meaning here, the normals among them, are ignored.
 
-    Args:
-        skip_broken: leave out Gaussians with a NaN or inf instead of refusing the file.
-        channels: those to read; the file holds raw values, but not what they mean. None: materials where it has them,
-            with the activations of default settings.
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+    skip_broken : bool, optional
+        Leave out Gaussians with a NaN or inf instead of refusing the file.
+    channels : tuple of Channel, optional
+        Those to read; the file holds raw values, but not what they mean. None: materials where it has them, with the
+        activations of default settings.
 
-    Returns:
+    Returns
+    -------
+    Surfels or Ellipsoids
         Surfels where there is no third scale, or all third scales are below exp(-10) world units; else ellipsoids.
         Float32, without gradient.
 
-    Raises:
-        FileNotFoundError: there is no such file.
-        RtgsError: not a PLY, truncated, a property is missing, NaN or inf, or ``gsply`` is needed and not installed.
+    Raises
+    ------
+    FileNotFoundError
+        There is no such file.
+    RtgsError
+        Not a PLY, truncated, a property is missing, NaN or inf, or ``gsply`` is needed and not installed.
     """
     path = Path(path)
     vertices = _read_vertices(path)

@@ -91,8 +91,10 @@ class Gaussians:
     def channel(self, name: str) -> Channel:
         """The declared channel of this name.
 
-        Raises:
-            KeyError: there is none.
+        Raises
+        ------
+        KeyError
+            There is none.
         """
         for channel in self.channels:
             if channel.name == name:
@@ -120,8 +122,10 @@ class Gaussians:
     def of(cls, tensors: Mapping[str, Tensor], channels: tuple[Channel, ...] = ()) -> Self:
         """Gaussians of named tensors (names of others are left out).
 
-        Raises:
-            KeyError: a parameter or a channel is missing.
+        Raises
+        ------
+        KeyError
+            A parameter or a channel is missing.
         """
         parameters = {name: tensors[name] for name in PARAMETERS}
         return cls(**parameters, channels=channels, raw={channel.name: tensors[channel.name] for channel in channels})

@@ -41,13 +41,30 @@ def create_method(
 ) -> Model:
     """The model of the method ``settings.name``, its base set initialised from the scene's points.
 
-    ``schedule`` decides when losses and density control are on; ``generator`` is drawn from at initialisation and by
-    density control, and its state travels in checkpoints. ``object_mesh``: of the scene's transparent object, for
-    methods with a stage that needs it.
+    Parameters
+    ----------
+    settings : MethodSettings
+        The method's name and numbers.
+    scene : Scene
+        What it is trained on.
+    schedule : ScheduleSettings
+        When losses and density control are on.
+    generator : torch.Generator
+        Drawn from at initialisation and by density control; its state travels in checkpoints.
+    object_mesh : ObjectMesh, optional
+        Of the scene's transparent object, for methods with a stage that needs it.
 
-    Raises:
-        ValueError: no method has this name, or it cannot use a mesh.
-        TypeError: a method from outside builds something else than a model.
+    Returns
+    -------
+    Model
+        For :class:`rtgs.train.trainer.Trainer`. It renders views, and its sets hold the Gaussians.
+
+    Raises
+    ------
+    ValueError
+        No method has this name, or it cannot use a mesh.
+    TypeError
+        A method from outside builds something else than a model.
     """
     from rtgs.methods.model import Model
     from rtgs.methods.parts.pixel_bound import bound_by_pixels

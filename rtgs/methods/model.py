@@ -37,11 +37,27 @@ NO_OPTIONS = RenderOptions()
 
 
 class Model:
-    """What trains (:class:`rtgs.train.method.Method`): the parts of a method and its loss."""
+    """What trains (:class:`rtgs.train.method.Method`): the parts of a method and its loss.
+
+    ``model["base"]`` is the set of that name; its ``gaussians`` are the Gaussians. ``model.loss`` is the table of loss
+    terms.
+
+    Parameters
+    ----------
+    setup : Setup
+        What the method is composed from.
+    parts : sequence of Part
+        In the order in which they join, the base set first.
+    terms : iterable of LossTerm or Decision, optional
+        In the order of the log, and in the place of those that this run is without, why.
+
+    Raises
+    ------
+    TypeError
+        The first part is no base set.
+    """
 
     def __init__(self, setup: Setup, parts: Sequence[Part], terms: Iterable[LossTerm | Decision] = ()) -> None:
-        """``parts`` in the order in which they join, the base set first; ``terms`` in the order of the log, and in the
-        place of those that this run is without, why."""
         first, *_ = parts
         if not isinstance(first, BaseSet):
             raise TypeError(f"the first part of method {setup.spec.name} is a {type(first).__name__}, not a BaseSet")
@@ -120,7 +136,26 @@ class Model:
         options: RenderOptions = NO_OPTIONS,
         mask: Tensor | None = None,
     ) -> RenderedView:
-        """Render one view (:meth:`rtgs.train.method.Method.render`)."""
+        """Render one view as of ``step``; the model stays as it is, but for draws of its generator in training.
+
+        Parameters
+        ----------
+        camera : Camera
+            Where it is seen from.
+        step : int
+            Of the training; after it, the number of steps that were trained.
+        mode : Mode
+            ``Mode.TRAIN`` adds the maps that the losses of this step need, and the observations of density control.
+        options : RenderOptions, optional
+            More maps.
+        mask : (H, W) bool Tensor, optional
+            The view's own mask of its transparent objects: for methods with a third stage.
+
+        Returns
+        -------
+        RenderedView
+            The image and its maps.
+        """
         frame = Frame(camera, step, mode, options, mask)
         raster = self.rasterize(frame)
         for part in reversed(self.parts.values()):
@@ -143,9 +178,12 @@ class Model:
     def after_step(self, step: int, observations: tuple[Observation, ...]) -> tuple[StepEvent, ...]:
         """Adam on all parts, then what they decide and change before step ``step + 1``.
 
-        Raises:
-            NonFiniteGradientError: a gradient held NaN or inf.
-            RtgsError: density control left no Gaussian.
+        Raises
+        ------
+        NonFiniteGradientError
+            A gradient held NaN or inf.
+        RtgsError
+            Density control left no Gaussian.
         """
         seen = {each.set_name: each for each in observations}
         for part in self.parts.values():

@@ -250,7 +250,7 @@ class TransmittanceSettings:
 
 @dataclass(frozen=True)
 class MethodSettings:
-    """A method: which recipe, with which numbers. ``name`` is what ``rtgs.methods.registry`` finds it by."""
+    """A method: which recipe, with which numbers. ``name`` is one that :func:`rtgs.methods.find_method` finds."""
 
     name: str = "2dgs"
     loss: LossSettings = field(default_factory=LossSettings)

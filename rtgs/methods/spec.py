@@ -113,9 +113,7 @@ class MethodSpec:
         if first is None or first.start is not at_once or first.on is not always or first.needs_object:
             raise ValueError(f"method {self.name!r}: its first stage must start at once, in every scene (step 0)")
         if keyless := [stage.name for stage in self.stages[1:] if not stage.start_key]:
-            raise ValueError(
-                f"method {self.name!r}: stage {keyless[0]} names no start_key, the key its start reads"
-            )
+            raise ValueError(f"method {self.name!r}: stage {keyless[0]} names no start_key, the key its start reads")
         names = [stage.name for stage in self.stages]
         if len(set(names)) < len(names):
             raise ValueError(f"method {self.name!r} has two stages of one name: {', '.join(names)}")

@@ -36,20 +36,42 @@ def rasterize_ellipsoids(
     Runs on ``torch.get_num_threads()`` threads; the result does not depend on their number, bit for bit. First
     derivatives only: a second backward pass through the gradients raises.
 
-    Args:
-        means: (N, 3) float32 centres, world frame. N = 0 is legal.
-        tangent_u, tangent_v: (N, 3) world; taken as given, not normalised. The third axis is their cross product.
-        scales: (N, 3) standard deviations along the three axes, world units.
-        opacities: (N,) in (0, 1].
-        features: (N, C), 1 <= C <= 32.
-        camera: pinhole camera; not differentiated.
-        background: (C,) composited behind everything; None is black. Not differentiated.
-        options: cut rules, dilation, antialiasing, optional outputs.
-        screen_probe: (N, 2), any values: its gradient receives 3DGS's densification signal, the gradient by the
-            projected centre in normalised device coordinates.
+    Parameters
+    ----------
+    means : (N, 3) Tensor
+        Centres, float32, world frame. N = 0 is legal.
+    tangent_u, tangent_v : (N, 3) Tensor
+        Axes, world; taken as given, not normalised. The third axis is their cross product.
+    scales : (N, 3) Tensor
+        Standard deviations along the three axes, world units.
+    opacities : (N,) Tensor
+        In (0, 1].
+    features : (N, C) Tensor
+        What is composited, 1 <= C <= 32; colours, for example.
+    camera : Camera
+        Pinhole camera; not differentiated.
+    background : (C,) Tensor, optional
+        Composited behind everything; None is black. Not differentiated.
+    options : EllipsoidOptions, optional
+        Cut rules, dilation, antialiasing, optional outputs.
+    screen_probe : (N, 2) Tensor, optional
+        Any values: its gradient receives 3DGS's densification signal, the gradient by the projected centre in
+        normalised device coordinates.
 
-    Raises:
-        ValueError: a shape, a dtype or an option does not fit; the message names the argument.
+    Returns
+    -------
+    EllipsoidBuffers
+        The composited features, the coverage, and the maps that were asked for.
+
+    Raises
+    ------
+    ValueError
+        A shape, a dtype or an option does not fit; the message names the argument.
+
+    References
+    ----------
+    .. [1] Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering", SIGGRAPH 2023.
+    .. [2] docs/rasterizer.md, "Ellipsoids"
     """
     check_shapes(means, tangent_u, tangent_v, scales, opacities, features, background, screen_probe, scale_axes=3)
     named = {"means": means, "tangent_u": tangent_u, "tangent_v": tangent_v, "scales": scales, "opacities": opacities}

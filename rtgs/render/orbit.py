@@ -58,8 +58,20 @@ def orbit_of_gaussians(gaussians: Gaussians, up: Tensor, picture: Picture, eleva
 def orbit_of_cameras(cameras: Sequence[Camera]) -> Orbit:
     """The circle that follows the cameras of a capture: their mean up and distance, around what they look at.
 
-    Raises:
-        ValueError: fewer than two cameras.
+    Parameters
+    ----------
+    cameras : sequence of Camera
+        At least two.
+
+    Returns
+    -------
+    Orbit
+        For :func:`orbit_cameras`.
+
+    Raises
+    ------
+    ValueError
+        Fewer than two cameras.
     """
     if len(cameras) < 2:
         raise ValueError(f"{len(cameras)} cameras; an orbit needs at least 2")
@@ -80,7 +92,22 @@ def orbit_of_cameras(cameras: Sequence[Camera]) -> Orbit:
 
 
 def orbit_cameras(orbit: Orbit, picture: Picture, count: int) -> list[Camera]:
-    """``count`` cameras evenly around the circle, all looking at the target."""
+    """Cameras evenly around a circle, all looking at its target.
+
+    Parameters
+    ----------
+    orbit : Orbit
+        The circle.
+    picture : Picture
+        Size and field of view of each camera.
+    count : int
+        How many cameras.
+
+    Returns
+    -------
+    list of Camera
+        In the order of the path.
+    """
     focal = max(picture.width, picture.height) / 2 / math.tan(math.radians(picture.fov) / 2)
     first = torch.linalg.cross(orbit.up, _least_aligned(orbit.up))
     first = _unit(first)

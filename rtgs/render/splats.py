@@ -24,14 +24,27 @@ def render_splats(
     sh_degree: int = 3,
     antialiased: bool = False,
 ) -> Tensor:
-    """(3, H, W) sRGB, not clamped: surfels as 2DGS shows them, ellipsoids as 3DGS does.
+    """Show Gaussians from a camera: surfels as 2DGS does, ellipsoids as 3DGS does. Without gradients.
 
-    Args:
-        gaussians: float32 on the CPU.
-        near: world units; what has its centre closer is left out.
-        background: (3,); None is black.
-        sh_degree: SH above is left out.
-        antialiased: of ellipsoids: the dilated footprint keeps its weight.
+    Parameters
+    ----------
+    gaussians : Surfels or Ellipsoids
+        Float32 on the CPU.
+    camera : Camera
+        Where they are seen from.
+    near : float, optional
+        World units; what has its centre closer is left out.
+    background : (3,) Tensor, optional
+        None is black.
+    sh_degree : int, optional
+        Spherical harmonics above it are left out.
+    antialiased : bool, optional
+        Of ellipsoids: the dilated footprint keeps its weight.
+
+    Returns
+    -------
+    (3, H, W) Tensor
+        sRGB, not clamped.
     """
     shown = activate_surfels(gaussians, camera.center.float(), sh_degree)
     parts = (shown.means, shown.tangent_u, shown.tangent_v, shown.scales, shown.opacities, shown.colors, camera)

@@ -35,19 +35,41 @@ def rasterize_surfels(
     Runs on ``torch.get_num_threads()`` threads; the result does not depend on their number, bit for bit. First
     derivatives only: a second backward pass through the gradients raises.
 
-    Args:
-        means: (N, 3) float32 centres, world frame. N = 0 is legal.
-        tangent_u, tangent_v: (N, 3) world; taken as given, not normalised.
-        scales: (N, 2) standard deviations along the tangents, world units.
-        opacities: (N,) in (0, 1].
-        features: (N, C), 1 <= C <= 32.
-        camera: pinhole camera; not differentiated.
-        background: (C,) composited behind everything; None is black. Not differentiated.
-        options: optional outputs, near and far plane, cutoffs.
-        screen_probe: (N, 2), any values: its gradient receives the densification signal (method.md 3.1).
+    Parameters
+    ----------
+    means : (N, 3) Tensor
+        Centres, float32, world frame. N = 0 is legal.
+    tangent_u, tangent_v : (N, 3) Tensor
+        Axes, world; taken as given, not normalised.
+    scales : (N, 2) Tensor
+        Standard deviations along the tangents, world units.
+    opacities : (N,) Tensor
+        In (0, 1].
+    features : (N, C) Tensor
+        What is composited, 1 <= C <= 32; colours, for example.
+    camera : Camera
+        Pinhole camera; not differentiated.
+    background : (C,) Tensor, optional
+        Composited behind everything; None is black. Not differentiated.
+    options : RasterOptions, optional
+        Optional outputs, near and far plane, cutoffs.
+    screen_probe : (N, 2) Tensor, optional
+        Any values: its gradient receives the densification signal (method.md 3.1).
 
-    Raises:
-        ValueError: a shape, a dtype or an option does not fit; the message names the argument.
+    Returns
+    -------
+    RasterBuffers
+        The composited features, the coverage, and the maps that were asked for.
+
+    Raises
+    ------
+    ValueError
+        A shape, a dtype or an option does not fit; the message names the argument.
+
+    References
+    ----------
+    .. [1] Huang et al., "2D Gaussian Splatting for Geometrically Accurate Radiance Fields", SIGGRAPH 2024.
+    .. [2] docs/rasterizer.md
     """
     check_shapes(means, tangent_u, tangent_v, scales, opacities, features, background, screen_probe)
     named = {"means": means, "tangent_u": tangent_u, "tangent_v": tangent_v, "scales": scales, "opacities": opacities}

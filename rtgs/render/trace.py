@@ -38,13 +38,24 @@ class SurfelTree:
         *,
         alpha_cutoff: float = _DEFAULT_OPTIONS.alpha_cutoff,
     ) -> SurfelTree:
-        """Make the tree of N surfels (shapes as in :func:`trace_surfels`); returns itself.
+        """Make the tree of N surfels.
 
-        Args:
-            alpha_cutoff: traces with a smaller one are refused, because their surfels reach further.
+        Parameters
+        ----------
+        means, tangent_u, tangent_v, scales, opacities : Tensor
+            N surfels, as for :func:`trace_surfels`.
+        alpha_cutoff : float, optional
+            Traces with a smaller one are refused, because their surfels reach further.
 
-        Raises:
-            ValueError: a shape, a dtype or the cutoff does not fit.
+        Returns
+        -------
+        SurfelTree
+            Itself.
+
+        Raises
+        ------
+        ValueError
+            A shape, a dtype or the cutoff does not fit.
         """
         arrays = _tree_arrays(means, tangent_u, tangent_v, scales, opacities, alpha_cutoff)
         self._native.build(*arrays, alpha_cutoff, torch.get_num_threads())
@@ -61,10 +72,24 @@ class SurfelTree:
         *,
         alpha_cutoff: float = _DEFAULT_OPTIONS.alpha_cutoff,
     ) -> SurfelTree:
-        """Fit the tree to surfels that moved; returns itself.
+        """Fit the tree to surfels that moved.
 
-        Raises:
-            ValueError: as ``build``; or the tree was built for another number of surfels.
+        Parameters
+        ----------
+        means, tangent_u, tangent_v, scales, opacities : Tensor
+            N surfels, as for :func:`trace_surfels`.
+        alpha_cutoff : float, optional
+            Traces with a smaller one are refused, because their surfels reach further.
+
+        Returns
+        -------
+        SurfelTree
+            Itself.
+
+        Raises
+        ------
+        ValueError
+            As ``build``; or the tree was built for another number of surfels.
         """
         arrays = _tree_arrays(means, tangent_u, tangent_v, scales, opacities, alpha_cutoff)
         if len(means) != self.surfels:
@@ -83,6 +108,7 @@ class SurfelTree:
 
     @property
     def nodes(self) -> int:
+        """How many the tree has."""
         return self._native.nodes
 
     @property
@@ -117,21 +143,43 @@ def trace_surfels(
     Runs on ``torch.get_num_threads()`` threads; the result does not depend on their number, bit for bit. First
     derivatives only: a second backward pass through the gradients raises.
 
-    Args:
-        means: (N, 3) float32 centres, world frame. N = 0 is legal.
-        tangent_u, tangent_v: (N, 3) orthonormal pairs, world; independent variables of the gradient.
-        scales: (N, 2) standard deviations along the tangents, world units.
-        opacities: (N,) in (0, 1].
-        origins, directions: (R, 3) world. Directions of any length; t is in units of it. R = 0 is legal.
-        tree: built or refitted on exactly these means, tangents, scales and opacities; None builds one.
-        features: (N, C), 1 <= C <= 32: what to accumulate; None accumulates none.
-        sh_dc, sh_rest: (N, 3) and (N, K, 3), K = 0, 3, 8 or 15: colour, evaluated at the unit ray direction.
-        options: bounds, cuts, optional outputs, which directions and gradients, order of the rays in the kernel.
-        probe: (N, 3), any values: its gradient receives the densification signal, the sum over hits of
-            dL/dmean * 0.5 * t (method.md 3.2).
+    Parameters
+    ----------
+    means : (N, 3) Tensor
+        Centres, float32, world frame. N = 0 is legal.
+    tangent_u, tangent_v : (N, 3) Tensor
+        Orthonormal pairs, world; independent variables of the gradient.
+    scales : (N, 2) Tensor
+        Standard deviations along the tangents, world units.
+    opacities : (N,) Tensor
+        In (0, 1].
+    origins, directions : (R, 3) Tensor
+        Rays, world. Directions of any length; t is in units of it. R = 0 is legal.
+    tree : SurfelTree, optional
+        Built or refitted on exactly these means, tangents, scales and opacities; None builds one.
+    features : (N, C) Tensor, optional
+        What to accumulate, 1 <= C <= 32; None accumulates none.
+    sh_dc, sh_rest : (N, 3) and (N, K, 3) Tensor, optional
+        Colour in spherical harmonics, K = 0, 3, 8 or 15, evaluated at the unit ray direction.
+    options : TraceOptions, optional
+        Bounds, cuts, optional outputs, which directions and gradients, order of the rays in the kernel.
+    probe : (N, 3) Tensor, optional
+        Any values: its gradient receives the densification signal, the sum over hits of dL/dmean * 0.5 * t
+        (method.md 3.2).
 
-    Raises:
-        ValueError: a shape, a dtype, an option or the tree does not fit; the message names the argument.
+    Returns
+    -------
+    TraceBuffers
+        What each ray met.
+
+    Raises
+    ------
+    ValueError
+        A shape, a dtype, an option or the tree does not fit; the message names the argument.
+
+    References
+    ----------
+    .. [1] docs/tracer.md
     """
     surfels = _named(means, tangent_u, tangent_v, scales, opacities)
     check_trace_shapes(surfels, origins, directions, features, sh_dc, sh_rest, probe, options)

@@ -112,12 +112,21 @@ class SceneSummary:
 def load_scene(settings: SceneSettings) -> Scene:
     """Import a capture: read, undistort, shrink and split the photos, filter the points.
 
-    Args:
-        settings: where the capture lies and what to make of it.
+    Parameters
+    ----------
+    settings : SceneSettings
+        Where the capture lies and what to make of it.
 
-    Raises:
-        CaptureError: the capture cannot be trained on; the message lists every problem that was found before reading
-            pixels, or the first unreadable file.
+    Returns
+    -------
+    Scene
+        Training views, test views and points, in the capture's world frame.
+
+    Raises
+    ------
+    CaptureError
+        The capture cannot be trained on; the message lists every problem that was found before reading pixels, or the
+        first unreadable file.
     """
     capture = read_capture(settings)
     findings = capture_findings(capture)

@@ -20,8 +20,10 @@ class CaptureError(RtgsError):
 class SceneSettings:
     """Import settings of one capture. Every relative path is relative to ``path``.
 
-    Raises:
-        RtgsError: a value outside its documented range (a misspelt format, a negative size).
+    Raises
+    ------
+    RtgsError
+        A value outside its documented range (a misspelt format, a negative size).
     """
 
     name: str = "scene"

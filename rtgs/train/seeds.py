@@ -13,5 +13,18 @@ def seed_for(seed: int, purpose: str) -> int:
 
 
 def generator_for(seed: int, purpose: str) -> torch.Generator:
-    """A torch generator seeded by :func:`seed_for`."""
+    """A torch generator of its own for one purpose, so that no two uses share a random stream.
+
+    Parameters
+    ----------
+    seed : int
+        Of the run.
+    purpose : str
+        Any word; methods are made with ``"initialise"``.
+
+    Returns
+    -------
+    torch.Generator
+        Seeded by :func:`seed_for`.
+    """
     return torch.Generator().manual_seed(seed_for(seed, purpose))

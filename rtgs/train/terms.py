@@ -32,13 +32,26 @@ TermValue = Callable[[RenderedView, "View"], Tensor | None]
 class LossTerm:
     """One weighted term.
 
-    Attributes:
-        name: in the log and in the guard's report.
-        weight: above 0; a term of weight 0 is not made.
-        value: the unweighted scalar with its graph, or None where the view has nothing for it.
-        start: first step at which the term acts.
-        until: first step at which it no longer does.
-        needs: maps of the base set that :attr:`value` reads.
+    Parameters
+    ----------
+    name : str
+        In the log and in the guard's report.
+    weight : float
+        Above 0; a term of weight 0 is not made.
+    value : callable
+        From the rendered view and the photo to the unweighted scalar with its graph, or to None where the view has
+        nothing for the term.
+    start : int, optional
+        First step at which the term acts.
+    until : float, optional
+        First step at which it no longer does.
+    needs : RenderOptions, optional
+        Maps of the base set that :attr:`value` reads.
+
+    Raises
+    ------
+    ValueError
+        The weight is not above 0.
     """
 
     name: str

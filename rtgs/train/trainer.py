@@ -89,6 +89,25 @@ class Trainer:
     With ``checkpoint_dir``, checkpoints go there and a run finds its way on from the newest of them, bit for bit as if
     it had not been interrupted (equal settings, scene, thread count, instruction set). The state at the end of the
     stage is the last checkpoint.
+
+    Parameters
+    ----------
+    method : Method
+        What is trained; :func:`rtgs.methods.create_method` makes it.
+    scene : Scene
+        Training views, and test views for the figures.
+    seed : int
+        Of the order of the views.
+    stage : Stage, optional
+        None: the method's first.
+    progress : Progress, optional
+        Who is told how far it is; None: nobody.
+    recorder : Recorder, optional
+        Who gets the metrics; None: nobody.
+    checkpoint_dir : Path, optional
+        None: no checkpoints.
+    observer : Observer, optional
+        Looks at the method after every step.
     """
 
     def __init__(
@@ -125,9 +144,17 @@ class Trainer:
     def run(self) -> TrainSummary:
         """Train until the end of the stage.
 
-        Raises:
-            TrainingDiverged: a loss or gradient is not finite; the last checkpoint is intact.
-            CheckpointError: ``checkpoint_dir`` holds checkpoints that cannot be used.
+        Returns
+        -------
+        TrainSummary
+            What was done, and how well it fits.
+
+        Raises
+        ------
+        TrainingDiverged
+            A loss or gradient is not finite; the last checkpoint is intact.
+        CheckpointError
+            ``checkpoint_dir`` holds checkpoints that cannot be used.
         """
         start_peak_memory()
         resumed_from = self._resume()
@@ -161,7 +188,13 @@ class Trainer:
         )
 
     def evaluate(self) -> float:
-        """Mean PSNR over the test views at the present step, images clamped to [0, 1]."""
+        """Mean PSNR over the test views at the present step, images clamped to [0, 1].
+
+        Returns
+        -------
+        float
+            In dB. The scene must have test views.
+        """
         with torch.no_grad():
             values = [
                 _psnr(self.method.render(view.camera, self._step, Mode.EVALUATE, mask=view.mask).image, view.image)
@@ -170,7 +203,13 @@ class Trainer:
         return sum(values) / len(values)
 
     def checkpoint(self) -> Checkpoint:
-        """The present state as a checkpoint."""
+        """The present state.
+
+        Returns
+        -------
+        Checkpoint
+            All that training needs to go on, for :func:`rtgs.train.checkpoint.save_checkpoint`.
+        """
         order = self._order.state()
         tensors = {f"method.{name}": tensor for name, tensor in self.method.state().items()}
         tensors["views.permutation"] = order.permutation

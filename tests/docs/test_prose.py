@@ -18,7 +18,7 @@ LIMITS = {
     "docs/rasterizer.md": 1_500,
     "docs/transmittance.md": 750,
 }
-REFERENCES = {"docs/method.md", "docs/decisions.md"}  # looked up by number, not read through
+REFERENCES = {"docs/method.md", "docs/decisions.md", "docs/api.md"}  # looked up by number, not read through
 LAST_LINE = 90  # of README: one screen of substance
 TARGET = re.compile(r"\]\([^()\s]+\)")
 LINK = re.compile(r"\]\(([^()\s#]+\.md)(?:#[\w-]+)?\)")
