@@ -21,7 +21,7 @@ from rtgs.mesh.record import MeshRecord
 from rtgs.mesh.score import container_mesh
 from rtgs.mesh.settings import HullSettings, ObjectSettings, TsdfSettings
 from rtgs.mesh.triangles import TriangleMesh, read_mesh_ply, write_mesh_ply
-from rtgs.methods import RenderedView, RenderOptions
+from rtgs.methods import Mode, RenderedView, RenderOptions
 from rtgs.render.buffers import RasterBuffers
 from rtgs.scenes.canonical import save_scene
 from rtgs.scenes.importers.embedded import embedded_capture
@@ -39,8 +39,7 @@ class SphereMethod:
 
     maps = ("depth", "median_depth")
 
-    def render(self, camera: Camera, step: int, options: RenderOptions | None = None) -> RenderedView:
-        assert options is not None
+    def render(self, camera: Camera, step: int, mode: Mode, options: RenderOptions) -> RenderedView:
         assert options.depth
         near, _ = sphere_depths(camera, 1.0)
         alpha = torch.isfinite(near).float() * 0.8

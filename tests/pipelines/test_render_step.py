@@ -13,7 +13,7 @@ import torch
 from pipelines.steps import render
 from pipelines.steps.views import read_render
 from rtgs.core.cameras import Camera
-from rtgs.methods import RenderedView, RenderOptions
+from rtgs.methods import Mode, RenderedView, RenderOptions
 from rtgs.render.buffers import RasterBuffers
 from rtgs.scenes.canonical import save_scene
 from rtgs.scenes.scene import Scene, View
@@ -31,7 +31,9 @@ class CountingMethod:
     maps: tuple[str, ...] = ("depth", "normal")
     asked: list[tuple[str, RenderOptions]] = field(default_factory=list)
 
-    def render(self, camera: Camera, step: int, options: RenderOptions, mask: torch.Tensor | None) -> RenderedView:
+    def render(
+        self, camera: Camera, step: int, mode: Mode, options: RenderOptions, mask: torch.Tensor | None
+    ) -> RenderedView:
         assert step == 100
         self.asked.append((camera.name, options))
         image = torch.full((3, HEIGHT, WIDTH), 0.75 if options.masks else 0.25)

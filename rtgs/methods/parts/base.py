@@ -67,7 +67,7 @@ class BaseSet(Part):
         self.settings = settings
         self.generator = setup.generator
         self.extent = scene.extent
-        self.run = setup.schedule
+        self.run_schedule = setup.schedule
         self.schedule = setup.schedule
         self.rules: BaseRules | None = None
         self.mcmc = mcmc_of(settings.density)
@@ -95,7 +95,7 @@ class BaseSet(Part):
 
     def sh_degree(self, step: int) -> int:
         """SH degree in use at ``step``."""
-        return sh_degree_at(self.run, step, self.set.gaussians.sh_degree)
+        return sh_degree_at(self.run_schedule, step, self.set.gaussians.sh_degree)
 
     # ---- rendering
 
@@ -149,7 +149,7 @@ class BaseSet(Part):
         """
         rules = self.rules
         if densify_due(self.schedule, following) if rules is None else rules.densify_due(following):
-            reset = opacity_was_reset(self.run, following)
+            reset = opacity_was_reset(self.run_schedule, following)
             yield densified(self.set, self.settings.density, self.generator, following, after_reset=reset)
         if not self.set.density.resets_opacity:
             return

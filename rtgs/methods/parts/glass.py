@@ -70,7 +70,7 @@ class Glass(Part):
         self.schedule = setup.schedule
         self.generator = setup.generator
         self.extent = setup.scene.extent
-        self.through = transmittance_plan(settings.transmittance, setup.schedule)
+        self.plan = transmittance_plan(settings.transmittance, setup.schedule)
         self.guide: ObjectGuide | None = None
         self.transmittance: TracedSet | None = None
         self.interface: InterfaceSet | None = None
@@ -86,8 +86,8 @@ class Glass(Part):
         mirror.through = self
         if setup.object_mesh is not None and settings.transmittance.enabled:
             self.guide = ObjectGuide(setup.object_mesh)
-            frozen = self.through.start if settings.transmittance.freeze_base else None
-            mirror.replan(self.through.base, frozen)
+            frozen = self.plan.start if settings.transmittance.freeze_base else None
+            mirror.replan(self.plan.base, frozen)
 
     @property
     def sets(self) -> tuple[GaussianSet, ...]:
@@ -213,7 +213,7 @@ class Glass(Part):
             surfels,
             optimizer=self.settings.optimizer.learning_faster(settings.rate_gain),
             density=settings.density,
-            means_lr_steps=self.through.own.means_lr_steps,
+            means_lr_steps=self.plan.own.means_lr_steps,
             extent=self.extent,
             rebuild_every=settings.rebuild_every,
         )
@@ -291,10 +291,10 @@ class Glass(Part):
         largest = min(self.transmittance.gaussians.sh_degree, self.settings.transmittance.sh_degree)
         if self._from_base:
             return min(self.base.sh_degree(step), largest)
-        return sh_degree_at(self.through.own, self.through.clock(step), largest)
+        return sh_degree_at(self.plan.own, self.plan.clock(step), largest)
 
     def _watching(self, own: TracedSet, step: int) -> bool:
-        return own.density.needs_signal and densify_ahead(self.through.own, self.through.clock(step))
+        return own.density.needs_signal and densify_ahead(self.plan.own, self.plan.clock(step))
 
     def _depth_loss_on(self, step: int) -> bool:
         loss = self.settings.loss
@@ -309,15 +309,15 @@ class Glass(Part):
         if self.interface is not None:
             self.interface.step(step, self.base.sh_degree(step))
         if self.transmittance is not None:
-            clock = self.through.clock(step)
+            clock = self.plan.clock(step)
             self.transmittance.step(clock, self._own_degree(step), observations.get(self.transmittance.name))
 
     def control(self, following: int) -> Iterator[StepEvent]:
         """Density control of the transmittance set on its own clock."""
         if self.transmittance is None:
             return
-        settings, own = self.settings.transmittance.density, self.through.own
-        clock = self.through.clock(following)
+        settings, own = self.settings.transmittance.density, self.plan.own
+        clock = self.plan.clock(following)
         self.transmittance.perturb(clock - 1, self.generator)
         if densify_due(own, clock):
             reset = opacity_was_reset(self.schedule, following)

@@ -1,0 +1,40 @@
+"""Trainings end with the bits they ended with when methods were classes: digests recorded by the code of that time.
+
+``golden_checkpoints.json`` holds the digest of every training artifact of the four methods on ball_statue, toycar and
+fox, preset ``smoke`` and 300 steps of ``quick``, by step and key. One instruction set and one PyTorch made them; on
+others, bits differ, and the test is skipped. When a recipe or a result is meant to change, its line goes.
+"""
+
+from __future__ import annotations
+
+import json
+from hashlib import sha256
+from pathlib import Path
+
+import pytest
+import torch
+
+from pipelines.cli.main import main
+from rtgs.native import core
+from rtgs.workflow import Store
+
+GOLDEN = json.loads(Path(__file__).with_name("golden_checkpoints.json").read_text())
+CASES = [(scene, method) for scene in ("ball_statue", "toycar") for method in ("2dgs", "3dgs", "envgs", "rtgs")]
+SHORT = ("preset=quick", "schedule.total=300")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("scene", "method"), CASES)
+def test_checkpoints_have_the_recorded_bits(scene: str, method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    if (core.isa(), torch.__version__) != (GOLDEN["isa"], GOLDEN["torch"]):
+        pytest.skip(f"recorded with {GOLDEN['isa']} and torch {GOLDEN['torch']}")
+    monkeypatch.setenv("RTGS_ROOT", str(tmp_path))
+    for words in (("preset=smoke",), SHORT):
+        assert main(["run", f"scene={scene}", f"method={method}", *words, "tracking=off", "threads=1"]) == 0
+    found = {}
+    for artifact in Store(tmp_path / "store").artifacts():
+        if artifact.manifest.step.startswith("train_"):
+            key = f"{artifact.manifest.step} {artifact.manifest.fingerprint[:16]}"
+            found[key] = sha256((artifact.folder / "checkpoint" / "state.safetensors").read_bytes()).hexdigest()
+    assert len(found) >= 2
+    assert found == {key: GOLDEN["checkpoints"].get(key) for key in found}
