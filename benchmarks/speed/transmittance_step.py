@@ -74,7 +74,7 @@ def trained_pair(name: str, steps: int, settle: int, more: Sequence[str]) -> tup
         Trainer(first, scene, seed=config.seed, stage=stage).run()
     third.load({key: tensor.clone() for key, tensor in first.state().items()})
     until = boundary + settle
-    Trainer(first, scene, seed=config.seed, stage=Stage("rest", boundary, until)).run()
+    Trainer(first, scene, seed=config.seed, stage=Stage("reflection", boundary, until)).run()
     Trainer(third, scene, seed=config.seed, stage=Stage("transmittance", boundary, until)).run()
     return first, third, scene, until
 

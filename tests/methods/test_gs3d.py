@@ -70,7 +70,7 @@ def test_antialiasing_is_a_setting_that_training_and_test_views_obey():
 
 
 def test_ablations_without_an_object_are_refused():
-    with pytest.raises(RtgsError, match="ablation=no_normal_loss takes nothing away from method 3dgs: it is for 2dgs"):
+    with pytest.raises(RtgsError, match="takes nothing away from method 3dgs, which has no surface: it is for 2dgs"):
         compose(["scene=demo", "method=3dgs", "ablation=no_normal_loss"])
     config, _ = compose(["scene=demo", "method=3dgs", "preset=paper", "ablation=mcmc"])
     assert config.method.density.strategy == "mcmc"

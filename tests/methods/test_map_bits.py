@@ -7,7 +7,7 @@ import torch
 from glass_cases import begun, glass_recipe, glass_scene, randomised
 from training_cases import small_method, small_scene, small_schedule, small_trainer
 
-from rtgs.methods import Method, RenderOptions
+from rtgs.methods import Method, Mode, RenderOptions
 from rtgs.scenes.scene import Scene
 
 
@@ -30,8 +30,8 @@ def test_maps_change_no_bit_of_the_image(name: str) -> None:
     maps = RenderOptions(depth=True, normal="normal" in method.maps, layers=True)
     for view in (*scene.test, *scene.train[:2]):
         with torch.no_grad():
-            alone = method.render(view.camera, 59, RenderOptions(), view.mask)
-            whole = method.render(view.camera, 59, maps, view.mask)
+            alone = method.render(view.camera, 59, Mode.EVALUATE, mask=view.mask)
+            whole = method.render(view.camera, 59, Mode.EVALUATE, maps, view.mask)
         assert alone.image.any()
         assert torch.equal(whole.image, alone.image)
         assert (whole.transparent is None) == (alone.transparent is None)

@@ -180,14 +180,14 @@ def test_a_wrong_tokenizer_is_a_message(tmp_path, tokenizer):
 @pytest.mark.parametrize(
     ("make_settings", "message"),
     [
-        (lambda: DetectorSettings(prompt=" . "), "name what to look for"),
+        (lambda: DetectorSettings(prompt=" . "), "what to look for"),
         (lambda: DetectorSettings(phrases="apart"), "masks.detector.phrases='apart'"),
-        (lambda: DetectorSettings(box_threshold=1.5), "must lie between 0 and 1"),
-        (lambda: SegmenterSettings(size=8), "masks.segmenter.size=8: must be at least 64"),
+        (lambda: DetectorSettings(box_threshold=1.5), "must be between 0 and 1"),
+        (lambda: SegmenterSettings(size=8), "masks.segmenter.size=8 must be at least 64"),
     ],
 )
 def test_settings_out_of_range_are_refused(make_settings, message):
-    with pytest.raises(PrepareError, match=message):
+    with pytest.raises(RtgsError, match=message):
         make_settings()
 
 
