@@ -119,7 +119,7 @@ def test_workers_over_ssh_run_each_step_once_and_a_killed_one_is_replaced(hosts,
         "train 0.2",
         "train 0.3",
     ]
-    assert (store.folder(counting) / "threads.txt").read_text() == "2 2"
+    assert (store.folder(counting) / "threads.txt").read_text() == "2 2 quiet"
 
 
 def _owner(lock_file: str) -> int:

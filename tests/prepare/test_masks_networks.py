@@ -12,6 +12,7 @@ pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
 pytest.importorskip("tokenizers")
 
+from rtgs.core.errors import RtgsError
 from rtgs.prepare.errors import PrepareError
 from rtgs.prepare.masks.detect import Box, Detector, PromptTokenizer, Tokens, box_iou, read_boxes, suppress
 from rtgs.prepare.masks.segment import Segmenter
