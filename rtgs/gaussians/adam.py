@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,9 +52,40 @@ def find_nonfinite(tensors: Iterable[tuple[str, Tensor | None]]) -> tuple[NonFin
         values = tensor.detach().contiguous().numpy()
         count = core.count_nonfinite(values, torch.get_num_threads())
         if count:
-            rows = np.flatnonzero(~np.isfinite(values.reshape(len(values), -1)).all(axis=1))
+            rows = np.flatnonzero(~np.isfinite(values.reshape(len(values) if values.ndim else 1, -1)).all(axis=1))
             found.append(NonFinite(name, count, tuple(rows[:REPORTED_ROWS].tolist())))
     return tuple(found)
+
+
+@dataclass(frozen=True)
+class Moving:
+    """A float32 tensor with a gradient, and what Adam knows of it. Rows are those of its first dimension."""
+
+    name: str
+    values: Tensor
+    first: Tensor  # moments, shaped as the values
+    second: Tensor
+    active: int  # floats of each row that are updated
+    rate: float
+
+
+def move(moving: Sequence[Moving], updates: int, betas: tuple[float, float], eps: float, step_index: int) -> None:
+    """One bias-corrected step of Adam on all of them, in place, in one native call.
+
+    ``updates``: how many there have been, this one included; ``step_index`` is for the message.
+
+    Raises:
+        NonFiniteGradientError: a gradient held NaN or inf. Such values counted as 0, all others were applied.
+    """
+    entries = []
+    for each in moving:
+        assert each.values.grad is not None
+        tensors = (each.values.detach(), each.values.grad.contiguous(), each.first, each.second)
+        entries.append((*(t.numpy() for t in tensors), each.active, each.rate / (1 - betas[0] ** updates)))
+        increment_version(each.values)  # a graph that still needs the old values refuses its backward pass
+    second_scale = 1 / math.sqrt(1 - betas[1] ** updates)
+    if core.adam_step(entries, *betas, eps, second_scale, torch.get_num_threads()):
+        raise NonFiniteGradientError(find_nonfinite((each.name, each.values.grad) for each in moving), step_index)
 
 
 class GaussianAdam:
@@ -116,7 +147,7 @@ class GaussianAdam:
         self.steps += 1
         s = self.settings
         rates = self.learning_rates(step_index)
-        entries = []
+        moving = []
         for name, values in self.gaussians.items():
             if values.grad is None:
                 continue
@@ -127,16 +158,8 @@ class GaussianAdam:
                     "change N through rtgs.gaussians.density.apply_plan"
                 )
             active = 3 * rest_count(self.sh_degree) if name == "sh_rest" else values[:1].numel()
-            step_size = rates[name] / (1 - s.beta1**self.steps)
-            gradient = values.grad.contiguous()
-            entries.append(
-                (values.detach().numpy(), gradient.numpy(), first.numpy(), second.numpy(), active, step_size)
-            )
-            increment_version(values)  # a graph that still needs the old values refuses its backward pass
-        second_scale = 1 / math.sqrt(1 - s.beta2**self.steps)
-        if core.adam_step(entries, s.beta1, s.beta2, s.eps, second_scale, torch.get_num_threads()):
-            report = find_nonfinite((name, values.grad) for name, values in self.gaussians.items())
-            raise NonFiniteGradientError(report, step_index)
+            moving.append(Moving(name, values, first, second, active, rates[name]))
+        move(moving, self.steps, (s.beta1, s.beta2), s.eps, step_index)
 
     @torch.no_grad()
     def clamp(self) -> None:

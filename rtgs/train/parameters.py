@@ -13,10 +13,8 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.autograd.graph import increment_version
 
-from rtgs.gaussians.adam import NonFiniteGradientError, find_nonfinite
-from rtgs.native import core
+from rtgs.gaussians.adam import Moving, move
 
 
 @dataclass(frozen=True)
@@ -96,21 +94,15 @@ class ParameterGroup:
         Raises:
             NonFiniteGradientError: a gradient held NaN or inf; gradients are kept for the report.
         """
-        rate, entries = self.rate.at(step), []
-        moving = {key: value for key, value in self._values.items() if value.grad is not None}
+        rate = self.rate.at(step)
+        moving = [
+            Moving(key, value, self._first[key], self._second[key], value[:1].numel() if value.ndim else 1, rate)
+            for key, value in self._values.items()
+            if value.grad is not None
+        ]
         if rate > 0 and moving:
             self.steps += 1
-            beta1, beta2 = self._betas
-            for key, value in moving.items():
-                assert value.grad is not None
-                rows = [tensor.reshape(1, -1).numpy() for tensor in (value.detach(), value.grad.contiguous())]
-                rows += [moments[key].reshape(1, -1).numpy() for moments in (self._first, self._second)]
-                entries.append((*rows, value.numel(), rate / (1 - beta1**self.steps)))
-                increment_version(value)
-            scale = 1 / math.sqrt(1 - beta2**self.steps)
-            if core.adam_step(entries, beta1, beta2, self._eps, scale, torch.get_num_threads()):
-                report = find_nonfinite((key, _rows(value.grad)) for key, value in moving.items())
-                raise NonFiniteGradientError(report, step)
+            move(moving, self.steps, self._betas, self._eps, step)
         for value in self._values.values():
             value.grad = None
         if self.limits is not None:
@@ -145,7 +137,3 @@ class ParameterGroup:
             self._values[key] = state[f"{self.name}.values.{key}"].clone().contiguous().requires_grad_()
             self._first[key] = state[f"{self.name}.adam.first.{key}"].clone().contiguous()
             self._second[key] = state[f"{self.name}.adam.second.{key}"].clone().contiguous()
-
-
-def _rows(gradient: Tensor | None) -> Tensor | None:
-    return None if gradient is None else gradient.reshape(len(gradient) if gradient.ndim else 1, -1)

@@ -273,3 +273,14 @@ def test_names_of_parts_and_of_what_they_save_are_their_own():
 
     with pytest.raises(ValueError, match=r"two sets, groups or parts of method 2dgs write base\.adam\.steps"):
         Model(setup, (method.base, Second())).state()
+
+
+def test_only_training_views_are_observed():
+    method, scene = make()
+    before = {name: tensor.clone() for name, tensor in method.state().items()}
+    seen = {mode: method.render(scene.train[0].camera, 5, mode).observations for mode in Mode}
+    assert seen[Mode.EVALUATE] == ()
+    (observed,) = seen[Mode.TRAIN]
+    assert (observed.set_name, len(observed.weight_sum)) == ("base", len(method["base"]))
+    after = method.state()
+    assert all(torch.equal(after[name], tensor) for name, tensor in before.items()), "rendering changes nothing"

@@ -113,6 +113,13 @@ def test_a_gradient_that_is_not_finite_is_named_and_kept():
     assert group["map"].grad is not None
 
 
+def test_a_single_number_is_named_as_well():
+    group = ParameterGroup("glass", {"index": torch.tensor(1.5)}, Rate(0.1))
+    group["index"].grad = torch.tensor(math.nan)
+    with pytest.raises(NonFiniteGradientError, match="index: 1 NaN or inf"):
+        group.step(0)
+
+
 def test_what_cannot_train_is_refused():
     with pytest.raises(ValueError, match="has no tensor"):
         ParameterGroup("light", {}, Rate(0.1))

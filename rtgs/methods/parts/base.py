@@ -18,6 +18,7 @@ from rtgs.methods.parts.gaussian_set import GaussianSet, densified, opacity_rese
 from rtgs.methods.parts.kinds import GaussianKind, RasterRequest
 from rtgs.methods.parts.part import Frame, Part, Raster, Rows
 from rtgs.methods.shading.diffuse import diffuse
+from rtgs.render.features import named_features
 from rtgs.train.method import Observation, RenderedView, RenderOptions, StepEvent
 from rtgs.train.schedule import (
     check_schedule,
@@ -166,10 +167,7 @@ def mcmc_of(density: DensitySettings) -> McmcSettings | None:
 
 def composited(gaussians: Gaussians, colors: Tensor) -> Tensor:
     """(N, C) what is composited of a set: SH colours (N, 3), then every channel as it is activated, in its order."""
-    if not gaussians.channels:
-        return colors
-    channels = (gaussians.activated(channel.name) for channel in gaussians.channels)
-    return torch.cat((colors, *(values.reshape(len(colors), -1) for values in channels)), dim=1)
+    return named_features(gaussians, colors)[1] if gaussians.channels else colors
 
 
 def _joined(base: Rows, appended: Sequence[Rows]) -> tuple[ActivatedSurfels, Tensor]:
