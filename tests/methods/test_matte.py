@@ -10,7 +10,8 @@ from reflective_cases import new_method, recipe, schedule, tiny
 
 from rtgs.methods import Mode, Stage
 from rtgs.methods.parts.matte import MatteEvidence, gather_evidence
-from rtgs.methods.settings import MatteSettings
+from rtgs.methods.parts.mirror import Mirror
+from rtgs.methods.settings import MatteSettings, PropagationSettings
 
 
 def test_evidence_is_the_share_of_specular_pixels_and_what_tracing_lowers_there():
@@ -56,3 +57,28 @@ def test_a_scene_with_mirrors_keeps_its_second_stage(name: str):
     assert told[0][1].startswith("goes on: ")
     assert len(method.sets) == 2
     assert all(decision.what != "the reflection stage ended early" for decision in method.decisions)
+
+
+@pytest.mark.parametrize("strength", [0.0, 0.8])
+def test_the_verdict_comes_before_anything_changes(strength: float, monkeypatch: pytest.MonkeyPatch):
+    """Judged at step 20, where the base set is densified too: on the set as it was trained."""
+    made = tiny(strength)
+    quiet = PropagationSettings(every=0)
+    method = new_method(recipe(matte=MatteSettings(probation=1 / 12, views=3), propagation=quiet), made, schedule())
+    method.begin(Stage("reflection", 15, 60))
+    judged: list[int] = []
+    look = Mirror._look
+
+    def counting(part: Mirror, view, step: int):
+        judged.append(len(method["base"]))
+        return look(part, view, step)
+
+    monkeypatch.setattr(Mirror, "_look", counting)
+    before = len(method["base"])
+    rendered = method.render(made.scene.train[0].camera, 19, Mode.TRAIN)
+    method.losses(rendered, made.scene.train[0], 19).total.backward()
+    kinds = [(event.kind, event.set_name) for event in method.after_step(19, rendered.observations)]
+    assert kinds[0] == ("decision", "reflection")
+    assert ("density", "base") in kinds[1:]
+    assert judged == [before] * 3
+    assert len(method["base"]) != before

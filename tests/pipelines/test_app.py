@@ -1,11 +1,11 @@
 """The whole chain on a capture of a few tiny pictures, through the command line."""
 
+# ruff: noqa: F811 (fixtures of app_cases)
+
 from __future__ import annotations
 
 import errno
 import json
-import logging
-import math
 import os
 import shutil
 import signal
@@ -18,7 +18,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import yaml
-from PIL import Image
+from app_cases import QUICK, _in_root, capture, root  # noqa: F401  (fixtures)
 from safetensors import SafetensorError
 
 from pipelines.cli.main import main, report_error
@@ -30,64 +30,6 @@ from rtgs.config.words import friendly_overrides
 from rtgs.scenes.settings import SceneSettings
 from rtgs.workflow import Store
 from rtgs.workflow.step import StepFailed
-
-WIDTH, HEIGHT, VIEWS = 32, 24, 10
-QUICK = (
-    "preset=smoke",
-    "scene.long_side=32",
-    "scene.points=random",
-    "scene.random_points=200",
-    "schedule.total=12",
-    "schedule.checkpoint_every=6",
-    "schedule.densify_every=5",
-    "tracking=off",
-    "threads=1",
-)
-
-
-def pose(index: int) -> list[list[float]]:
-    """Camera to world (OpenGL axes) on a ring around the origin, looking at it."""
-    angle = 2 * math.pi * index / VIEWS
-    backward = np.array([math.cos(angle), 0.2, math.sin(angle)])
-    backward /= np.linalg.norm(backward)
-    right = np.cross([0.0, 1.0, 0.0], backward)
-    right /= np.linalg.norm(right)
-    matrix = np.eye(4)
-    matrix[:3, :3] = np.stack([right, np.cross(backward, right), backward], axis=1)
-    matrix[:3, 3] = 3 * backward
-    return matrix.tolist()
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory) -> Path:
-    """A nerfstudio capture of ten pictures."""
-    folder = tmp_path_factory.mktemp("captures") / "tiny room"
-    (folder / "images").mkdir(parents=True)
-    frames = []
-    y, x = np.mgrid[0:HEIGHT, 0:WIDTH]
-    for index in range(VIEWS):
-        picture = np.stack([128 + 90 * np.sin(x / 5 + index), 128 + 90 * np.cos(y / 4), 100 + x], axis=-1)
-        Image.fromarray(picture.clip(0, 255).astype(np.uint8)).save(folder / "images" / f"{index:03d}.png")
-        frames.append({"file_path": f"images/{index:03d}.png", "transform_matrix": pose(index)})
-    shared = {"w": WIDTH, "h": HEIGHT, "fl_x": 30.0, "fl_y": 30.0, "cx": 16.0, "cy": 12.0, "camera_model": "PINHOLE"}
-    (folder / "transforms.json").write_text(json.dumps(shared | {"frames": frames}))
-    return folder
-
-
-@pytest.fixture(scope="module")
-def root(tmp_path_factory) -> Path:
-    return tmp_path_factory.mktemp("root")
-
-
-@pytest.fixture(autouse=True)
-def _in_root(root, monkeypatch):
-    """Commands run as from an empty folder; the loggers Hydra sets up are put back."""
-    monkeypatch.chdir(root)
-    monkeypatch.setenv("RTGS_ROOT", str(root))
-    monkeypatch.delenv("RTGS_DEBUG", raising=False)
-    handlers, level = logging.root.handlers[:], logging.root.level
-    yield
-    logging.root.handlers[:], logging.root.level = handlers, level
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from accept_steps import PACKAGES, ROOT, project
-from test_app import QUICK
+from app_cases import QUICK
 from test_transmittance_stage import TINY, write_capture
 
 from pipelines.planning.graph import KINDS, build_graph

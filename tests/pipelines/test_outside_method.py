@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from app_cases import QUICK, _in_root, capture, root  # noqa: F401  (fixtures)
 from safetensors.torch import load_file
-from test_app import QUICK, _in_root, capture, root  # noqa: F401  (fixtures)
 from training_cases import small_scene, small_schedule
 
 from pipelines.cli.main import main

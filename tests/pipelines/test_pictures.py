@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_app import QUICK, _in_root, capture, root  # noqa: F401  (fixtures)
+from app_cases import QUICK, _in_root, capture, root  # noqa: F401  (fixtures)
 
 from pipelines.cli.main import main
 from pipelines.steps import pictures

@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 
 import pytest
-from test_app import QUICK, _in_root, capture, root  # noqa: F401  (fixtures)
+from app_cases import QUICK, _in_root, capture, root  # noqa: F401  (fixtures)
 
 from pipelines.cli.main import main
 from pipelines.planning.graph import build_graph

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from app_cases import QUICK, _in_root, root  # noqa: F401  (fixtures)
 from PIL import Image
-from test_app import QUICK, _in_root, root  # noqa: F401  (fixtures)
 
 from pipelines.cli.main import main
 from pipelines.planning.graph import RunGraph, build_graph
