@@ -82,3 +82,4 @@ def test_the_verdict_comes_before_anything_changes(strength: float, monkeypatch:
     assert ("density", "base") in kinds[1:]
     assert judged == [before] * 3
     assert len(method["base"]) != before
+    assert (method.base.rules is None) == (method.find("reflection") is None), "a matte scene goes on by its schedule"

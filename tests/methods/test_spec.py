@@ -92,3 +92,6 @@ def test_where_there_is_no_object_the_stage_before_goes_on():
     before = spec.before("transmittance", settings(0.3), PLAN)
     assert (before.name, before.from_step, before.until) == ("reflection", 30, 100)
     assert spec.before("transmittance", settings(1.0), PLAN).name == "diffuse"
+    last = StageSpec("polish", lambda settings, schedule: 80, "method.reflection.start")
+    longer = MethodSpec("longer", (DIFFUSE, REFLECTION, TRANSMITTANCE, last), unbuilt)
+    assert longer.before("transmittance", settings(0.3), PLAN).name == "reflection"

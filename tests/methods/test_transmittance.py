@@ -371,3 +371,11 @@ def test_the_boundary_is_measured(made: GlassScene):
     assert scores.specular is not None
     assert 0 < scores.specular < 1
     assert "silhouettes IoU" in str(scores)
+
+
+def test_the_noise_of_density_control_is_put_on_the_set_behind_glass(made: GlassScene, monkeypatch: pytest.MonkeyPatch):
+    method = begun(glass_recipe(), made)
+    steps: list[int] = []
+    monkeypatch.setattr(method["transmittance"], "perturb", lambda step, generator: steps.append(step))
+    _events_of(method, 33)
+    assert steps == [3], "on its own clock, which is 0 at step 30"
