@@ -31,7 +31,7 @@ def main() -> None:
 
     # Raw parameters become what a renderer takes. Colours are those seen from this camera.
     camera, near = scene.train[0].camera, 0.02 * scene.extent
-    rows = rtgs.activate_surfels(gaussians, camera.center.float(), sh_degree=3)
+    rows = rtgs.activate_gaussians(gaussians, camera.center.float(), sh_degree=3)
     shape = (rows.means, rows.tangent_u, rows.tangent_v, rows.scales, rows.opacities)
     if isinstance(gaussians, rtgs.Ellipsoids):
         maps = rtgs.EllipsoidOptions(near=near, depth=True)

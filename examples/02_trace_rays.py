@@ -23,7 +23,7 @@ def main() -> None:
     generator = rtgs.generator_for(0, "initialise")
     surfels = rtgs.gaussians_from_points(rtgs.Surfels, scene.points, scene.point_colors, start, generator)
     camera = scene.train[0].camera
-    rows = rtgs.activate_surfels(surfels.requires_grad_(False), camera.center.float(), sh_degree=3)
+    rows = rtgs.activate_gaussians(surfels.requires_grad_(False), camera.center.float(), sh_degree=3)
     shape = (rows.means, rows.tangent_u, rows.tangent_v, rows.scales, rows.opacities)
     tree = rtgs.SurfelTree().build(*shape)
     print(f"a tree of {tree.nodes} nodes over {tree.surfels} surfels")

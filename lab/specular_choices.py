@@ -13,7 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from hashlib import sha256
 from pathlib import Path
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from rtgs.config.schema import RunConfig
     from rtgs.methods import Method
     from rtgs.scenes.scene import Scene, View
-    from rtgs.train.method import SpecularLayers
 
 HELD_OUT = 8  # every so many training views
 MIRROR_BALL = "mirror_ball"  # benchmarks/common/mirror_scene.py, instead of an embedded scene
@@ -238,12 +237,12 @@ def score(method: Method, choice: str, seed: int, seconds: float, setting: Setti
     return ChoiceScore(choice, seed, *figures)
 
 
-def _layer_means(layers: SpecularLayers, inside: Tensor) -> list[float]:
+def _layer_means(layers: Mapping[str, Tensor], inside: Tensor) -> list[float]:
     """k_s, k_s elsewhere, w_r, roughness, f0, C_r: means over specular pixels."""
-    share, color = layers.specular[inside], layers.reflected_color[:, inside]
-    gain = layers.reflection[:, inside].sum() / (share * color).sum().clamp_min(1e-9)
-    f0 = layers.f0 if layers.f0.ndim == 2 else layers.f0.mean(0)
-    means = (share, layers.specular[~inside], gain, layers.roughness[inside], f0[inside], color)
+    share, color = layers["specular"][inside], layers["reflected_color"][:, inside]
+    gain = layers["reflection"][:, inside].sum() / (share * color).sum().clamp_min(1e-9)
+    f0 = layers["f0"] if layers["f0"].ndim == 2 else layers["f0"].mean(0)
+    means = (share, layers["specular"][~inside], gain, layers["roughness"][inside], f0[inside], color)
     return [float(values.mean()) for values in means]
 
 
@@ -258,8 +257,8 @@ def _write_picture(path: Path, rendered, view: View) -> None:
     parts = [view.image, rendered.image, 0.5 - 0.5 * rendered.buffers.normal]
     if rendered.layers is not None:
         maps = rendered.layers
-        parts += [maps.diffuse, maps.reflection, maps.reflected_color]
-        parts += [m.expand(3, *m.shape[-2:]) for m in (maps.specular, maps.roughness.sqrt(), maps.f0)]
+        parts += [maps["diffuse"], maps["reflection"], maps["reflected_color"]]
+        parts += [m.expand(3, *m.shape[-2:]) for m in (maps["specular"], maps["roughness"].sqrt(), maps["f0"])]
     rows = [torch.cat([p.clamp(0, 1) for p in parts[k : k + 3]], dim=2) for k in range(0, len(parts), 3)]
     pixels = (torch.cat(rows, dim=1).permute(1, 2, 0) * 255).round().to(torch.uint8)
     write_png(path, pixels.numpy())

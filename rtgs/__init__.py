@@ -14,12 +14,12 @@ if TYPE_CHECKING:
     from rtgs.core.errors import RtgsError
     from rtgs.evaluate.images import to_bytes, write_png
     from rtgs.evaluate.metrics import psnr
-    from rtgs.gaussians.activate import activate_surfels
+    from rtgs.gaussians.activate import activate_gaussians
     from rtgs.gaussians.ellipsoids import Ellipsoids
     from rtgs.gaussians.initialize import gaussians_from_points
     from rtgs.gaussians.ply import read_gaussians, write_ply
     from rtgs.gaussians.settings import InitSettings
-    from rtgs.gaussians.surfels import ActivatedSurfels, Surfels
+    from rtgs.gaussians.surfels import ActivatedGaussians, Surfels
     from rtgs.methods import create_method
     from rtgs.methods.model import Model
     from rtgs.methods.settings import MethodSettings
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from rtgs.train.trainer import Trainer, TrainSummary
 
 __all__ = [
-    "ActivatedSurfels",
+    "ActivatedGaussians",
     "Camera",
     "EllipsoidBuffers",
     "EllipsoidOptions",
@@ -75,7 +75,7 @@ __all__ = [
     "Trainer",
     "View",
     "__version__",
-    "activate_surfels",
+    "activate_gaussians",
     "create_method",
     "gaussians_from_points",
     "generator_for",
@@ -99,12 +99,12 @@ _PLACES = {
     "rtgs.core.errors": "RtgsError",
     "rtgs.evaluate.images": "to_bytes write_png",
     "rtgs.evaluate.metrics": "psnr",
-    "rtgs.gaussians.activate": "activate_surfels",
+    "rtgs.gaussians.activate": "activate_gaussians",
     "rtgs.gaussians.ellipsoids": "Ellipsoids",
     "rtgs.gaussians.initialize": "gaussians_from_points",
     "rtgs.gaussians.ply": "read_gaussians write_ply",
     "rtgs.gaussians.settings": "InitSettings",
-    "rtgs.gaussians.surfels": "ActivatedSurfels Surfels",
+    "rtgs.gaussians.surfels": "ActivatedGaussians Surfels",
     "rtgs.methods": "create_method",
     "rtgs.methods.model": "Model",
     "rtgs.methods.settings": "MethodSettings",

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import torch
 
-from rtgs.gaussians.activate import activate_surfels
+from rtgs.gaussians.activate import activate_gaussians
 from rtgs.gaussians.adam import GaussianAdam, find_nonfinite
 from rtgs.gaussians.density import DensityControl
 from rtgs.gaussians.initialize import surfels_from_points
@@ -108,11 +108,11 @@ def measure(count: int, repeat: int) -> dict[str, float]:
     results: dict[str, float] = {}
     for isa in core.available_isas():
         core.select_isa(isa)
-        forward, both = time_activation(surfels, activate_surfels, repeat)
+        forward, both = time_activation(surfels, activate_gaussians, repeat)
         results[f"activate_forward_{isa}"], results[f"activate_both_{isa}"] = forward, both
     core.select_isa(core.available_isas()[0])
     torch.set_num_threads(2)
-    results["activate_both_2_threads"] = time_activation(surfels, activate_surfels, repeat)[1]
+    results["activate_both_2_threads"] = time_activation(surfels, activate_gaussians, repeat)[1]
     torch.set_num_threads(1)
     results["activate_both_torch"] = time_activation(surfels, activate, max(repeat // 10, 3))[1]
     results |= time_adam(surfels, repeat)

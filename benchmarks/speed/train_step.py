@@ -23,7 +23,7 @@ from torch import Tensor
 from benchmarks.common.yardstick_scene import yardstick_case
 from rtgs.core.cameras import Camera
 from rtgs.gaussians.settings import OptimizerSettings
-from rtgs.gaussians.surfels import ActivatedSurfels
+from rtgs.gaussians.surfels import ActivatedGaussians
 from rtgs.methods import create_method
 from rtgs.methods.parts.gaussian_set import GaussianSet
 from rtgs.methods.parts.kinds import surfel_options
@@ -152,7 +152,7 @@ def _with_gradient(buffers: RasterBuffers) -> list[Tensor]:
     return [tensor for tensor in found if tensor is not None]
 
 
-def _shaded(activated: ActivatedSurfels) -> list[Tensor]:
+def _shaded(activated: ActivatedGaussians) -> list[Tensor]:
     return [activated.tangent_u, activated.tangent_v, activated.scales, activated.opacities, activated.colors]
 
 

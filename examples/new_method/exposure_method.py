@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from rtgs.methods import MethodSpec
@@ -14,6 +15,14 @@ if TYPE_CHECKING:
     from rtgs.methods.spec import Setup
 
 
+@dataclass(frozen=True)
+class ExposureSettings:
+    """The keys ``method.own.<name>``."""
+
+    rate: float = 0.01  # of Adam
+    near_one: float = 0.1  # weight of the loss that keeps the gains near 1; 0: there is none
+
+
 def build(setup: Setup) -> Model:
     """Compose what trains. PyTorch is imported here, so that planning a run stays quick."""
     import torch
@@ -22,11 +31,12 @@ def build(setup: Setup) -> Model:
     from rtgs.methods.model import Model
     from rtgs.methods.parts.base import BaseSet
     from rtgs.methods.parts.kinds import SURFELS
-    from rtgs.methods.parts.part import Frame, Part, Raster
-    from rtgs.methods.shading.diffuse import diffuse
+    from rtgs.methods.parts.part import Frame, Part
     from rtgs.train.method import RenderedView
     from rtgs.train.parameters import ParameterGroup, Rate
     from rtgs.train.terms import LossTerm
+
+    settings: ExposureSettings = setup.own
 
     class Exposure(Part):
         """Three gains: parameters that are no rows of Gaussians."""
@@ -34,16 +44,15 @@ def build(setup: Setup) -> Model:
         name = "exposure"
 
         def __init__(self) -> None:
-            gain = {"gain": torch.ones(3)}
-            self.group = ParameterGroup("exposure", gain, Rate(0.01, final=0.001, steps=1000), limits=(0.25, 4.0))
+            rate = Rate(settings.rate, final=settings.rate / 10, steps=1000)
+            self.group = ParameterGroup("exposure", {"gain": torch.ones(3)}, rate, limits=(0.25, 4.0))
 
         @property
         def groups(self) -> tuple[ParameterGroup, ...]:
             return (self.group,)
 
-        def shade(self, frame: Frame, raster: Raster) -> RenderedView:
-            image = self.group["gain"][:, None, None] * diffuse(raster.buffers)
-            return RenderedView(frame.camera, image, raster.buffers, observations=raster.observations)
+        def finish(self, frame: Frame, shaded: RenderedView) -> RenderedView:
+            return replace(shaded, image=self.group["gain"][:, None, None] * shaded.image)
 
     exposure = Exposure()
 
@@ -51,9 +60,10 @@ def build(setup: Setup) -> Model:
         def near_one(rendered: RenderedView, view: object) -> torch.Tensor:
             return (exposure.group["gain"] - 1).square().mean()
 
-        yield LossTerm("exposure", weight=0.1, value=near_one)
+        if settings.near_one > 0:
+            yield LossTerm("exposure", weight=settings.near_one, value=near_one)
 
     return Model(setup, (BaseSet(setup, SURFELS), exposure), (*surface_terms(setup), *terms()))
 
 
-SPEC = MethodSpec("exposure", stages=(DIFFUSE,), build=build, has=frozenset({SURFACE}))
+SPEC = MethodSpec("exposure", stages=(DIFFUSE,), build=build, has=frozenset({SURFACE}), own=ExposureSettings)

@@ -97,7 +97,7 @@ def render(params: RenderParams, context: StepContext) -> None:
             tensors = {"image": rendered.image.contiguous()}
             if params.maps:
                 tensors |= view_maps(rendered)
-            if rendered.transparent is not None and view.mask is not None:
+            if "transparent" in rendered.maps and view.mask is not None:
                 given = RenderOptions(masks="given")
                 tensors[GIVEN] = method.render(
                     view.camera, stage.until, Mode.EVALUATE, given, view.mask

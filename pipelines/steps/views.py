@@ -18,8 +18,7 @@ def view_maps(rendered: RenderedView) -> dict[str, Tensor]:
     depth = buffers.depth / buffers.alpha.clamp_min(1e-6)  # the buffer holds the sum of w z
     maps = {"depth": depth, "normal": buffers.normal, "alpha": buffers.alpha}
     if rendered.layers is not None:
-        layers = vars(rendered.layers).items()
-        maps |= {name: tensor.float() for name, tensor in layers if tensor is not None}
+        maps |= {name: tensor.float() for name, tensor in rendered.layers.items()}
     return {name: tensor.contiguous() for name, tensor in maps.items() if tensor is not None}
 
 

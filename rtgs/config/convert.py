@@ -33,6 +33,8 @@ def to_run_config(composed: DictConfig, choices: Choices) -> tuple[RunConfig, Ch
     assert isinstance(values, dict)
     config = build(RunConfig, {str(key): value for key, value in values.items()})
     _refuse_idle_ablation(config, choices)
+    if config.method.own:
+        find_method(config.method.name).own_settings(config.method)
     scene = config.scene
     if config.table.data == "paper" and scene.path.startswith("embedded:"):
         raise RtgsError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import types
 import typing
 from collections.abc import Mapping, Sequence
@@ -33,6 +34,32 @@ def build(cls: type, values: Mapping[str, Any], where: str = "") -> Any:
         elif (meant := left_out_at(item)) is not dataclasses.MISSING:
             made[item.name] = meant
     return cls(**made)
+
+
+def build_checked(cls: type, values: Mapping[str, Any], where: str) -> Any:
+    """As :func:`build`, of a flat dataclass whose values nobody has checked: bool, int, float or str.
+
+    Raises:
+        RtgsError: also where a value is of another type than its field.
+    """
+    hints = hints_of(cls)
+    if unknown := sorted(set(values) - set(hints)):
+        close = difflib.get_close_matches(unknown[0], hints, n=1)
+        advice = f"; did you mean {close[0]}?" if close else ""
+        raise RtgsError(f"{where}.{unknown[0]} is no key: {where} has {', '.join(hints) or 'none'}{advice}")
+    fitting = {name: _plain(hints[name], value, f"{where}.{name}") for name, value in values.items()}
+    return build(cls, fitting, where)
+
+
+def _plain(hint: Any, value: Any, where: str) -> Any:
+    if hint is float and type(value) is int:
+        return float(value)
+    if hint in (bool, int, float, str) and type(value) is not hint:
+        raise RtgsError(f"{where}={value!r} must be {_SPOKEN[hint]}")
+    return value
+
+
+_SPOKEN = {bool: "true or false", int: "a whole number", float: "a number", str: "a word"}
 
 
 def _value(hint: Any, value: Any, where: str) -> Any:

@@ -81,7 +81,7 @@ def boundary_scores(method: Method, scene: Scene, mesh: ObjectMesh, step: int) -
         common, whole = common + int((hit & mask).sum()), whole + int((hit | mask).sum())
         if index % max(1, len(masked) // RENDERED_VIEWS):
             continue
-        specular = _rendered(method, view, step).specular
+        specular = _rendered(method, view, step).maps.get("specular")
         if specular is not None:
             weights, pixels = weights + float(specular[mask].sum()), pixels + float(mask.sum())
     parts = [_against_truth(method, view, guide, step) for view in _with_truth(scene.test)]

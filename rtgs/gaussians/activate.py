@@ -11,25 +11,25 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from rtgs.gaussians.primitives import PARAMETERS, Gaussians
-from rtgs.gaussians.surfels import ActivatedSurfels
+from rtgs.gaussians.surfels import ActivatedGaussians
 from rtgs.native import core
 
 
-def activate_surfels(surfels: Gaussians, camera_center: Tensor, sh_degree: int) -> ActivatedSurfels:
+def activate_gaussians(gaussians: Gaussians, camera_center: Tensor, sh_degree: int) -> ActivatedGaussians:
     """Activate for one camera, float32, differentiable by every raw parameter.
 
     Parameters
     ----------
-    surfels : Surfels or Ellipsoids
+    gaussians : Surfels or Ellipsoids
         N of them, float32 on the CPU.
     camera_center : (3,) Tensor
         World; a constant (it gets no gradient).
     sh_degree : int
-        Active degree of the spherical harmonics; capped by what the surfels hold.
+        Active degree of the spherical harmonics; capped by what they hold.
 
     Returns
     -------
-    ActivatedSurfels
+    ActivatedGaussians
         What the renderers take.
 
     Raises
@@ -40,26 +40,26 @@ def activate_surfels(surfels: Gaussians, camera_center: Tensor, sh_degree: int) 
         Shapes do not match.
     """
     for name in PARAMETERS:  # not the channels
-        tensor = surfels[name]
+        tensor = gaussians[name]
         if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
             raise TypeError(
-                f"surfels.{name} is {tensor.dtype} on {tensor.device}; activate_surfels takes float32 on the CPU "
+                f"gaussians.{name} is {tensor.dtype} on {tensor.device}; activate_gaussians takes float32 on the CPU "
                 "(rtgs.gaussians.surfels.activate takes any dtype)"
             )
-    raw = tuple(surfels[name] for name in PARAMETERS)
+    raw = tuple(gaussians[name] for name in PARAMETERS)
     center = tuple(camera_center.tolist())
-    outputs = _Activate.apply(center, min(sh_degree, surfels.sh_degree), *raw)
-    return ActivatedSurfels(surfels.means, *outputs)
+    outputs = _Activate.apply(center, min(sh_degree, gaussians.sh_degree), *raw)
+    return ActivatedGaussians(gaussians.means, *outputs)
 
 
-def activate_geometry(surfels: Gaussians) -> ActivatedSurfels:
+def activate_geometry(gaussians: Gaussians) -> ActivatedGaussians:
     """Tangents, scales and opacities alone, differentiable; the colours of the result mean nothing.
 
     For the tracer, which evaluates colours itself, at the direction of each ray.
     """
-    raw = [surfels[name] for name in PARAMETERS]
+    raw = [gaussians[name] for name in PARAMETERS]
     raw[4], raw[5] = raw[4].detach(), raw[5].new_empty(len(raw[5]), 0, 3)
-    return ActivatedSurfels(surfels.means, *_Activate.apply((0.0, 0.0, 0.0), 0, *raw))
+    return ActivatedGaussians(gaussians.means, *_Activate.apply((0.0, 0.0, 0.0), 0, *raw))
 
 
 def arrays(tensors: tuple[Tensor, ...]) -> tuple:
@@ -75,7 +75,7 @@ class _Activate(torch.autograd.Function):
         outputs = (rows(count, 3), rows(count, 3), torch.empty_like(raw[1]), rows(count), rows(count, 3))
         needs_backward = any(ctx.needs_input_grad)
         saved = rows(core.activation_saved_size(count)) if needs_backward else None
-        core.activate_surfels(
+        core.activate_gaussians(
             arrays(raw),
             center,
             degree,
@@ -93,7 +93,7 @@ class _Activate(torch.autograd.Function):
     def backward(ctx, *upstream: Tensor):
         *raw, scales, saved = ctx.saved_tensors
         gradients = tuple(torch.empty_like(tensor, memory_format=torch.contiguous_format) for tensor in raw)
-        core.activate_surfels_backward(
+        core.activate_gaussians_backward(
             arrays(tuple(raw)),
             ctx.center,
             ctx.degree,

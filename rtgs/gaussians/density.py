@@ -133,7 +133,7 @@ class DensityControl:
             self._clear(count)
         if len(self.visible_steps) != count:
             raise ValueError(
-                f"{count} surfels observed, but the statistics are of {len(self.visible_steps)}; "
+                f"{count} Gaussians observed, but the statistics are of {len(self.visible_steps)}; "
                 "change N through rtgs.gaussians.density.apply_plan"
             )
         norm = torch.hypot(*signal.detach().unbind(1)) if signal.shape[1] == 2 else signal.detach().norm(dim=1)
@@ -143,7 +143,7 @@ class DensityControl:
             bad = (~torch.isfinite(either)).nonzero().flatten().tolist()
             if bad:
                 raise FloatingPointError(
-                    f"densification signal or weight sum of {len(bad)} surfels is NaN or inf (first ids {bad[:8]})"
+                    f"densification signal or weight sum of {len(bad)} Gaussians is NaN or inf (first ids {bad[:8]})"
                 )
         self.signal_sum += norm
         self.weight_sum += weight

@@ -14,7 +14,7 @@ from rtgs.gaussians.primitives import Gaussians, tangents
 class Ellipsoids(Gaussians):
     """N ellipsoids: three scales along columns 0, 1, 2 of the rotation.
 
-    Activation is that of surfels (``rtgs.gaussians.surfels.activate``, ``rtgs.gaussians.activate.activate_surfels``);
+    Activation is that of surfels (``rtgs.gaussians.surfels.activate``, ``rtgs.gaussians.activate.activate_gaussians``);
     the third axis is tangent_u x tangent_v.
     """
 

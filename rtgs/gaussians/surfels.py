@@ -22,7 +22,7 @@ class Surfels(Gaussians):
 
 
 @dataclass(frozen=True)
-class ActivatedSurfels:
+class ActivatedGaussians:
     """What a renderer takes: everything after the activations, for one camera centre."""
 
     means: Tensor  # (N, 3) world
@@ -33,8 +33,8 @@ class ActivatedSurfels:
     colors: Tensor  # (N, 3) >= 0, SH evaluated at (mean - camera centre) / |.|
 
 
-def activate(surfels: Gaussians, camera_center: Tensor, sh_degree: int) -> ActivatedSurfels:
-    """Activate with plain torch (any dtype, differentiable): the readable twin of ``activate_surfels``.
+def activate(surfels: Gaussians, camera_center: Tensor, sh_degree: int) -> ActivatedGaussians:
+    """Activate with plain torch (any dtype, differentiable): the readable twin of ``activate_gaussians``.
 
     ``camera_center`` (3,) world, taken as constant; SH above ``sh_degree`` is left out. A mean at the camera centre has
     no direction: its colour is that of degree 0, with no gradient by it.
@@ -44,13 +44,13 @@ def activate(surfels: Gaussians, camera_center: Tensor, sh_degree: int) -> Activ
     directions = unit_or_zero(surfels.means - camera_center.to(surfels.means))
     degree = min(sh_degree, surfels.sh_degree)
     colors = evaluate_sh(surfels.sh_dc, surfels.sh_rest, directions, degree).clamp_min(0)
-    return ActivatedSurfels(surfels.means, tangent_u, tangent_v, scales, surfels.opacity_logits.sigmoid(), colors)
+    return ActivatedGaussians(surfels.means, tangent_u, tangent_v, scales, surfels.opacity_logits.sigmoid(), colors)
 
 
 __all__ = [
     "LOG_SCALE_LIMIT",
     "SHORTEST",
-    "ActivatedSurfels",
+    "ActivatedGaussians",
     "Surfels",
     "activate",
     "tangents",

@@ -18,7 +18,6 @@ from rtgs.train.method import (
     Observation,
     RenderedView,
     RenderOptions,
-    SpecularLayers,
     Stage,
     StepEvent,
 )
@@ -75,7 +74,9 @@ def create_method(
     pixels = max((view.camera.width * view.camera.height for view in scene.train), default=0)
     settings, lowered = bound_by_pixels(settings, pixels)
     stages = spec.timeline(settings, schedule, transparent=object_mesh is not None)
-    made = spec.build(Setup(spec, settings, scene, schedule, generator, object_mesh, stages, lowered))
+    made = spec.build(
+        Setup(spec, settings, scene, schedule, generator, object_mesh, stages, lowered, spec.own_settings(settings))
+    )
     if not isinstance(made, Model):
         raise TypeError(f"method {spec.name} was built as a {type(made).__name__}, not as a rtgs.methods.model.Model")
     return made
@@ -91,7 +92,6 @@ __all__ = [
     "RenderOptions",
     "RenderedView",
     "Setup",
-    "SpecularLayers",
     "Stage",
     "StageSpec",
     "StepEvent",

@@ -16,7 +16,7 @@ from rtgs.core.decisions import Decision
 from rtgs.methods.parts.base import BaseSet
 from rtgs.methods.parts.glass import Glass
 from rtgs.methods.settings import MethodSettings
-from rtgs.methods.shading.straight import depth_loss, mesh_normal_loss
+from rtgs.methods.shading.straight import FirstBounce, depth_loss, mesh_normal_loss
 from rtgs.pretrained.weights import MissingWeights
 from rtgs.render.buffers import RasterBuffers
 from rtgs.train.losses import (
@@ -162,7 +162,7 @@ def perceptual_terms(setup: Setup) -> Terms:
         return (Decision("no perceptual loss", str(error).splitlines()[0]),)
 
     def value(rendered: RenderedView, view: View) -> Tensor | None:
-        return None if rendered.specular is None else perceptual(rendered.image, view.image, setup.generator)
+        return None if "specular" not in rendered.maps else perceptual(rendered.image, view.image, setup.generator)
 
     start = loss_start(loss.perceptual_start, setup.schedule.total)
     return (LossTerm("perceptual", loss.perceptual, value, start),)
@@ -180,10 +180,11 @@ def specular_terms(setup: Setup, mask: Callable[[View], Tensor | None] = masked_
         return ()
 
     def value(rendered: RenderedView, view: View) -> Tensor | None:
-        where = None if rendered.specular is None else mask(view)
-        if where is None or rendered.specular is None:
+        specular = rendered.maps.get("specular")
+        where = None if specular is None else mask(view)
+        if where is None or specular is None:
             return None
-        return (where * (loss.specular_target - rendered.specular).clamp_min(0)).mean()
+        return (where * (loss.specular_target - specular).clamp_min(0)).mean()
 
     return (LossTerm("specular", loss.specular, value, loss_start(loss.specular_start, setup.schedule.total)),)
 
@@ -193,23 +194,22 @@ def glass_terms(setup: Setup, glass: Glass) -> Terms:
     loss, interface = setup.settings.loss, setup.settings.transmittance.interface
 
     def depth(rendered: RenderedView, view: View) -> Tensor | None:
-        if rendered.first_bounce is None:
+        if not isinstance(rendered.kept, FirstBounce):
             return None
         pixels = rendered.camera.height * rendered.camera.width
-        return depth_loss(rendered.first_bounce, loss.transmission_depth_form, pixels)
+        return depth_loss(rendered.kept, loss.transmission_depth_form, pixels)
 
     def hold(rendered: RenderedView, view: View) -> Tensor | None:
         return None if glass.interface is None else glass.interface.turned()
 
     def normal(rendered: RenderedView, view: View) -> Tensor | None:
         """1 - n . N where the object is seen; n rasterised, N of the mesh."""
-        if glass.interface is None or glass.guide is None or rendered.transparent is None:
+        transparent = rendered.maps.get("transparent")
+        if glass.interface is None or glass.guide is None or transparent is None:
             return None
         surfaces = glass.guide.surfaces(rendered.camera)
         assert rendered.buffers.normal is not None
-        return mesh_normal_loss(
-            rendered.buffers.normal, surfaces.normal, rendered.transparent & glass.on_glass(surfaces)
-        )
+        return mesh_normal_loss(rendered.buffers.normal, surfaces.normal, transparent & glass.on_glass(surfaces))
 
     until = loss_start(interface.normal_loss_until, setup.schedule.total)
     found = (

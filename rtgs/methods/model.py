@@ -149,7 +149,7 @@ class Model:
         options : RenderOptions, optional
             More maps.
         mask : (H, W) bool Tensor, optional
-            The view's own mask of its transparent objects: for methods with a third stage.
+            The view's own mask of its transparent objects: for methods with a stage for them.
 
         Returns
         -------
@@ -157,6 +157,15 @@ class Model:
             The image and its maps.
         """
         frame = Frame(camera, step, mode, options, mask)
+        for part in self.parts.values():
+            frame = part.aim(frame)
+        shaded = self._shade(frame)
+        for part in self.parts.values():
+            shaded = part.finish(frame, shaded)
+        return shaded
+
+    def _shade(self, frame: Frame) -> RenderedView:
+        """By the last part that does."""
         raster = self.rasterize(frame)
         for part in reversed(self.parts.values()):
             if (shaded := part.shade(frame, raster)) is not None:

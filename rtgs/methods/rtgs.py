@@ -21,11 +21,13 @@ def build(setup: Setup) -> Model:
     from rtgs.methods.model import Model
     from rtgs.methods.parts.base import BaseSet
     from rtgs.methods.parts.glass import Glass
+    from rtgs.methods.parts.glass_evidence import has_masks
     from rtgs.methods.parts.kinds import SURFELS
     from rtgs.methods.parts.mirror import Mirror
 
     base = BaseSet(setup, SURFELS)
-    mirror = Mirror(setup, base)
+    masked = "the scene has masks of a transparent object" if has_masks(setup.scene.train) else ""
+    mirror = Mirror(setup, base, spared=masked)
     glass = Glass(setup, base, mirror)
     terms = (
         *surface_terms(setup),

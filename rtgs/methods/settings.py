@@ -6,7 +6,7 @@ Boundaries are shares of the run (``schedule.total``), intervals are steps.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 from rtgs.core.refuse import refuse_bad_numbers, refuse_unknown_words, refuse_unless
 from rtgs.gaussians.settings import DensitySettings, InitSettings, MaterialSettings, OptimizerSettings
@@ -263,3 +263,5 @@ class MethodSettings:
     reflection: ReflectionSettings = field(default_factory=ReflectionSettings)
     transmittance: TransmittanceSettings = field(default_factory=TransmittanceSettings)  # of rtgs
     paper_schedule: ScheduleSettings = field(default_factory=ScheduleSettings)  # preset=paper takes this one
+    # Numbers that only this method has: :attr:`rtgs.methods.spec.MethodSpec.own` says which, and checks them.
+    own: dict[str, Any] = field(default_factory=dict, metadata={"recipe": "unless", "value": {}})

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from rtgs.core.build import build_checked
 from rtgs.core.decisions import Decision
+from rtgs.core.errors import RtgsError
 from rtgs.train.method import Method, Stage
 
 if TYPE_CHECKING:
@@ -75,6 +77,7 @@ class Setup:
 
     Attributes:
         settings: with caps as this scene's pictures bound them.
+        own: an instance of :attr:`MethodSpec.own`; None: the method has no settings of its own.
         generator: drawn from at initialisation, in training views and by density control; it travels in checkpoints.
         object_mesh: of the scene's transparent object, for methods with a stage that needs it; None: without it.
         stages: of this run.
@@ -89,6 +92,7 @@ class Setup:
     object_mesh: ObjectMesh | None = None
     stages: tuple[Stage, ...] = ()
     decisions: tuple[Decision, ...] = ()
+    own: Any = None
 
 
 @dataclass(frozen=True)
@@ -101,12 +105,15 @@ class MethodSpec:
         build: composes what trains from a :class:`Setup`. It imports torch, and is called when
             something trains or renders.
         has: which of :data:`FEATURES` it has. Ablations say what they take away, and are refused by methods without it.
+        own: a frozen dataclass of plain values, the settings that only this method has: keys ``method.own.<field>``.
+            None: there are none.
     """
 
     name: str
     stages: tuple[StageSpec, ...]
     build: Callable[[Setup], Method]
     has: frozenset[str] = frozenset()
+    own: type | None = None
 
     def __post_init__(self) -> None:
         first = self.stages[0] if self.stages else None
@@ -119,6 +126,19 @@ class MethodSpec:
             raise ValueError(f"method {self.name!r} has two stages of one name: {', '.join(names)}")
         if unknown := self.has - set(FEATURES):
             raise ValueError(f"method {self.name!r} has {', '.join(sorted(unknown))}: known are {', '.join(FEATURES)}")
+
+    def own_settings(self, settings: MethodSettings) -> Any:
+        """An instance of :attr:`own` with the values of ``settings.own``; None where the method has none.
+
+        Raises:
+            RtgsError: a key that the method does not have, or a value it cannot take.
+        """
+        if self.own is None:
+            if settings.own:
+                keys = ", ".join(f"method.own.{name}" for name in settings.own)
+                raise RtgsError(f"{keys}: method {self.name} has no settings of its own; remove it")
+            return None
+        return build_checked(self.own, settings.own, "method.own")
 
     def stage(self, name: str) -> StageSpec:
         """The stage of this name.

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from rtgs.core.cameras import Camera
-from rtgs.gaussians.activate import activate_surfels
+from rtgs.gaussians.activate import activate_gaussians
 from rtgs.gaussians.ellipsoids import Ellipsoids
 from rtgs.gaussians.surfels import Surfels
 from rtgs.render.buffers import EllipsoidOptions, RasterOptions
@@ -46,7 +46,7 @@ def render_splats(
     (3, H, W) Tensor
         sRGB, not clamped.
     """
-    shown = activate_surfels(gaussians, camera.center.float(), sh_degree)
+    shown = activate_gaussians(gaussians, camera.center.float(), sh_degree)
     parts = (shown.means, shown.tangent_u, shown.tangent_v, shown.scales, shown.opacities, shown.colors, camera)
     if isinstance(gaussians, Ellipsoids):
         options = EllipsoidOptions(near=near, antialiased=antialiased)

@@ -18,7 +18,7 @@ SHOWN = 5
 
 
 @dataclass(frozen=True)
-class BadSurfels:
+class BadGaussians:
     """Surfels with a non-finite gradient or parameter."""
 
     set_name: str
@@ -26,7 +26,7 @@ class BadSurfels:
     count: int
     ids: tuple[int, ...]  # the first few
     values: tuple[str, ...]  # theirs, as text
-    unit: str = "surfel"  # what a row is; of a group of other parameters "row"
+    unit: str = "Gaussian"  # what a row is; of a group of other parameters "row"
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Divergence:
     view: str
     terms: tuple[tuple[str, float], ...]  # every loss term of the step
     bad_terms: tuple[str, ...]
-    surfels: tuple[BadSurfels, ...]
+    gaussians: tuple[BadGaussians, ...]
     cause: str  # message of the part that noticed; empty for a loss
 
 
@@ -49,10 +49,10 @@ class TrainingDiverged(RtgsError):
         lines = [f"training diverged at step {divergence.step}, view {divergence.view!r}"]
         if divergence.bad_terms:
             lines.append(f"loss terms that are not finite: {', '.join(divergence.bad_terms)}")
-        if divergence.cause and not divergence.surfels:
+        if divergence.cause and not divergence.gaussians:
             lines.append(divergence.cause)
         lines.append("terms: " + ", ".join(f"{name} {value:.6g}" for name, value in divergence.terms))
-        for bad in divergence.surfels:
+        for bad in divergence.gaussians:
             examples = "; ".join(
                 f"{bad.unit} {index}: {value}" for index, value in zip(bad.ids, bad.values, strict=True)
             )
@@ -74,7 +74,7 @@ def check_loss(terms: LossValues, method: Method, step: int, view: str) -> float
     loss = float(terms.total.detach())
     if math.isfinite(loss):
         return loss
-    terms.total.backward()  # for the report alone: its gradients tell which surfels are involved
+    terms.total.backward()  # for the report alone: its gradients tell which Gaussians are involved
     raise diverged(terms, method, step, view)
 
 
@@ -82,13 +82,13 @@ def diverged(terms: LossValues, method: Method, step: int, view: str, *, cause: 
     """The report of a step whose loss or gradients (still in ``.grad``) are not finite."""
     bad = tuple(term.name for term in terms.terms if not math.isfinite(term.value))
     values = tuple((term.name, term.value) for term in terms.terms)
-    return TrainingDiverged(Divergence(step, view, values, bad, _bad_surfels(method), cause))
+    return TrainingDiverged(Divergence(step, view, values, bad, _bad_gaussians(method), cause))
 
 
-def _bad_surfels(method: Method) -> tuple[BadSurfels, ...]:
+def _bad_gaussians(method: Method) -> tuple[BadGaussians, ...]:
     """Every parameter and gradient with non-finite rows."""
     found = []
-    parts = (*((each, "surfel") for each in method.sets), *((each, "row") for each in method.groups))
+    parts = (*((each, "Gaussian") for each in method.sets), *((each, "row") for each in method.groups))
     for part, unit in parts:
         for name, tensor in part.tensors():
             for label, values in ((name, tensor.detach()), (f"gradient of {name}", tensor.grad)):
@@ -98,7 +98,7 @@ def _bad_surfels(method: Method) -> tuple[BadSurfels, ...]:
     return tuple(found)
 
 
-def _describe(part: Trained, unit: str, label: str, values: Tensor | None) -> BadSurfels | None:
+def _describe(part: Trained, unit: str, label: str, values: Tensor | None) -> BadGaussians | None:
     if values is None:
         return None
     rows = values.reshape(len(values) if values.ndim else 1, -1)
@@ -107,4 +107,4 @@ def _describe(part: Trained, unit: str, label: str, values: Tensor | None) -> Ba
         return None
     first = ids[:SHOWN].tolist()
     texts = tuple(", ".join(f"{value:.4g}" for value in rows[index, :4].tolist()) for index in first)
-    return BadSurfels(part.name, label, len(ids), tuple(first), texts, unit)
+    return BadGaussians(part.name, label, len(ids), tuple(first), texts, unit)

@@ -7,12 +7,12 @@ these members can be trained.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from enum import Enum
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
 
     from torch import Tensor
 
@@ -52,36 +52,8 @@ class RenderOptions:
 
     def plus(self, other: RenderOptions) -> RenderOptions:
         """These maps and those of ``other``."""
-        flags = [field.name for field in fields(self) if field.name != "masks"]
+        flags = [each.name for each in fields(self) if each.name != "masks"]
         return replace(self, **{name: getattr(self, name) or getattr(other, name) for name in flags})
-
-
-@dataclass(frozen=True)
-class SpecularLayers:
-    """What a view with reflection is made of: image = diffuse part (1 - k_s) C_d + reflection + transmission."""
-
-    diffuse: Tensor  # (3, H, W) C_d
-    reflection: Tensor  # (3, H, W) k_s w_r C_r; 0 where no ray was traced
-    reflected_color: Tensor  # (3, H, W) C_r; 0 where no ray was traced
-    specular: Tensor  # (H, W) k_s as composited
-    roughness: Tensor  # (H, W) in 0..1
-    f0: Tensor  # (H, W), or (3, H, W) for rgb
-    traced: Tensor  # (H, W) bool
-    transmission: Tensor | None = None  # (3, H, W) k_s w_t C_t; 0 outside transparent objects; None: no third stage
-    transmitted_color: Tensor | None = None  # (3, H, W) C_t
-
-
-@dataclass(frozen=True)
-class FirstBounce:
-    """What the first straight rays met, for the loss on their depth (method.md 5.1); R rays that have a back surface.
-
-    Depths count from the first surface, in z-depth units.
-    """
-
-    depth: Tensor  # (R,) Z_1 = sum of w t, with its graph
-    alpha: Tensor  # (R,) A_1, with its graph
-    thickness: Tensor  # (R,) z_2 - z_s, no graph
-    beyond: Tensor | None = None  # (R,) sum of w (t - thickness) over the hits behind the back surface, if asked for
 
 
 @dataclass(frozen=True)
@@ -95,15 +67,23 @@ class Observation:
 
 @dataclass(frozen=True)
 class RenderedView:
-    """What a method shows from one camera."""
+    """What a method shows from one camera.
+
+    Maps and layers go by name; each is (C, H, W) or (H, W). Names of this package's methods:
+
+    - ``maps``, with their graph in training: ``specular``, k_s as composited, of methods with reflection;
+      ``transparent``, bool, the pixels that got straight rays.
+    - ``layers``, image = (1 - specular) diffuse + reflection + transmission where ``traced``: ``diffuse``
+      C_d; ``reflection`` k_s w_r C_r and ``transmission`` k_s w_t C_t, 0 where no ray was traced; ``reflected_color``
+      C_r and ``transmitted_color`` C_t; ``specular``, ``roughness``, ``f0`` as composited; ``traced``, bool.
+    """
 
     camera: Camera
     image: Tensor  # (3, H, W) sRGB, not clamped
     buffers: RasterBuffers  # of the base set; maps that were not asked for are None
-    layers: SpecularLayers | None = None  # of methods with reflection, when asked for
-    specular: Tensor | None = None  # (H, W) k_s as composited, with its graph
-    first_bounce: FirstBounce | None = None  # of the third stage, in training
-    transparent: Tensor | None = None  # (H, W) bool: pixels that got straight rays; None: no third stage
+    layers: Mapping[str, Tensor] | None = None  # what the image is made of, when asked for; None: it has no layers
+    maps: Mapping[str, Tensor] = field(default_factory=dict)
+    kept: object = None  # what the part that shaded keeps for loss terms of its own; None: nothing
     observations: tuple[Observation, ...] = ()  # in training, of the sets whose density control will run again
 
 
@@ -204,7 +184,7 @@ class Method(Protocol):
         """Render one view as of ``step``; leaves the method as it is, but for draws of its generator in training.
 
         ``mode=TRAIN`` adds the maps that the losses of this step need, and the observations of density control.
-        ``mask`` (H, W) bool, the view's own of its transparent objects: for methods with a third stage.
+        ``mask`` (H, W) bool, the view's own of its transparent objects: for methods with a stage for them.
         """
         ...
 

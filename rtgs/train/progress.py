@@ -68,7 +68,7 @@ class LineProgress:
         left = (self._total - report.step) / max(rate, 1e-9)
         self.note(
             f"{self._title}: step {report.step}/{self._total}  loss {report.loss:.4f}  PSNR {report.psnr:.2f} dB  "
-            f"{report.surfels:,} surfels  {rate:.1f} steps/s  {_clock(left)} left"
+            f"{report.surfels:,} Gaussians  {rate:.1f} steps/s  {_clock(left)} left"
         )
 
     def note(self, text: str) -> None:
@@ -107,7 +107,8 @@ class BarProgress:
         if self._task is None:
             return
         rate = (report.step - self._first) / max(time.monotonic() - self._began, 1e-9)
-        status = f"loss {report.loss:.3f}  {report.psnr:.1f} dB  {report.surfels:,} surfels  {rate:.0f}/s"  # 80 columns
+        # fits into 80 columns
+        status = f"loss {report.loss:.3f}  {report.psnr:.1f} dB  {report.surfels:,} Gaussians  {rate:.0f}/s"
         self._bar.update(self._task, completed=report.step, status=status)
 
     def note(self, text: str) -> None:

@@ -8,16 +8,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from surfel_cases import random_surfels
 
-from rtgs.gaussians.activate import activate_surfels
+from rtgs.gaussians.activate import activate_gaussians
 from rtgs.gaussians.ellipsoids import Ellipsoids
-from rtgs.gaussians.surfels import ActivatedSurfels, Surfels, activate
+from rtgs.gaussians.surfels import ActivatedGaussians, Surfels, activate
 from rtgs.native import core
 
 CENTER = torch.tensor([0.1, -0.2, 0.3])
 OUTPUTS = ("tangent_u", "tangent_v", "scales", "opacities", "colors")
 
 
-def outputs_of(activated: ActivatedSurfels) -> list[torch.Tensor]:
+def outputs_of(activated: ActivatedGaussians) -> list[torch.Tensor]:
     return [getattr(activated, name) for name in OUTPUTS]
 
 
@@ -39,7 +39,7 @@ def gradients(surfels: Surfels, outputs: list[torch.Tensor], upstream: list[torc
 
 def compare(surfels: Surfels, degree: int, tolerance: float = 1e-5) -> None:
     twin_surfels = in_double(surfels)
-    native = outputs_of(activate_surfels(surfels, CENTER, degree))
+    native = outputs_of(activate_gaussians(surfels, CENTER, degree))
     twin = outputs_of(activate(twin_surfels, CENTER, degree))
     for name, a, b in zip(OUTPUTS, native, twin):
         error = (a.double() - b).abs()
@@ -70,7 +70,7 @@ def test_any_count(isa, count):
     if count:
         compare(surfels, 3)
     else:
-        activated = activate_surfels(surfels, CENTER, 3)
+        activated = activate_gaussians(surfels, CENTER, 3)
         (activated.colors.sum() + activated.scales.sum()).backward()
         assert activated.tangent_u.shape == (0, 3)
         assert surfels.quaternions.grad.shape == (0, 4)
@@ -122,14 +122,14 @@ def test_matches_twin_drawn(seed, count, degree, length, spread, degenerate, isa
 
 def test_sh_degree_above_the_stored_one_is_capped():
     surfels = random_surfels(5, coefficients=3)
-    assert torch.equal(activate_surfels(surfels, CENTER, 3).colors, activate_surfels(surfels, CENTER, 1).colors)
+    assert torch.equal(activate_gaussians(surfels, CENTER, 3).colors, activate_gaussians(surfels, CENTER, 1).colors)
 
 
 def test_zero_quaternion_is_the_identity_without_gradient(isa):
     surfels = random_surfels(3)
     with torch.no_grad():
         surfels.quaternions[1] = 0
-    for function, data in ((activate_surfels, surfels), (activate, in_double(surfels))):
+    for function, data in ((activate_gaussians, surfels), (activate, in_double(surfels))):
         outputs = outputs_of(function(data, CENTER, 3))
         assert outputs[0][1].tolist() == [1, 0, 0]
         assert outputs[1][1].tolist() == [0, 1, 0]
@@ -145,7 +145,7 @@ def test_mean_at_the_camera_centre_has_the_colour_of_degree_zero(isa):
     with torch.no_grad():
         surfels.means[4] = CENTER
     compare(surfels, 3)
-    outputs = activate_surfels(surfels, CENTER, 3)
+    outputs = activate_gaussians(surfels, CENTER, 3)
     expected = (0.5 + 0.28209479 * surfels.sh_dc[4]).clamp_min(0)
     torch.testing.assert_close(outputs.colors[4], expected)
     outputs.colors.sum().backward()
@@ -160,7 +160,7 @@ def test_extreme_values_stay_finite(isa):
                 values[row] = 1e30 if values is surfels.sh_rest and value > 1e30 else value
             surfels.sh_rest[row] = max(min(value, 1e30), -1e30)
             surfels.sh_dc[row] = max(min(value, 1e30), -1e30)
-    activated = activate_surfels(surfels, CENTER, 3)
+    activated = activate_gaussians(surfels, CENTER, 3)
     outputs = outputs_of(activated)
     for name, values in zip(OUTPUTS, outputs):
         assert torch.isfinite(values).all(), name
@@ -175,7 +175,7 @@ def test_log_scales_beyond_the_limit_saturate(isa):
     with torch.no_grad():
         surfels.log_scales[0] = torch.tensor([41.0, -500.0])
     compare(surfels, 0)
-    activate_surfels(surfels, CENTER, 0).scales.sum().backward()
+    activate_gaussians(surfels, CENTER, 0).scales.sum().backward()
     assert (surfels.log_scales.grad[0] == 0).all()
     assert (surfels.log_scales.grad[1:] > 0).all()
 
@@ -184,7 +184,7 @@ def test_clamped_colours_pass_no_gradient(isa):
     surfels = random_surfels(3, coefficients=0)
     with torch.no_grad():
         surfels.sh_dc[:] = torch.tensor([[-10.0, 1.0, 0.0], [2.0, -3.0, -1.7], [0.0, 0.0, 0.0]])
-    activated = activate_surfels(surfels, CENTER, 0)
+    activated = activate_gaussians(surfels, CENTER, 0)
     activated.colors.sum().backward()
     shown = surfels.sh_dc.detach() * 0.28209479 + 0.5 > 0
     assert torch.equal(surfels.sh_dc.grad != 0, shown)
@@ -197,7 +197,7 @@ def test_same_bits_for_any_thread_count(isa):
     before = torch.get_num_threads()
     for threads in (1, 2, 3):
         torch.set_num_threads(threads)
-        outputs = outputs_of(activate_surfels(surfels, CENTER, 3))
+        outputs = outputs_of(activate_gaussians(surfels, CENTER, 3))
         results.append([*outputs, *gradients(surfels, outputs, upstream_for(outputs))])
     torch.set_num_threads(before)
     for other in results[1:]:
@@ -206,7 +206,7 @@ def test_same_bits_for_any_thread_count(isa):
 
 def test_only_some_outputs_used():
     surfels = random_surfels(10)
-    activate_surfels(surfels, CENTER, 3).opacities.sum().backward()
+    activate_gaussians(surfels, CENTER, 3).opacities.sum().backward()
     assert (surfels.opacity_logits.grad > 0).all()
     assert (surfels.sh_rest.grad == 0).all()
     assert (surfels.quaternions.grad == 0).all()
@@ -214,7 +214,7 @@ def test_only_some_outputs_used():
 
 def test_without_gradient_keeps_no_graph():
     with torch.no_grad():
-        assert not activate_surfels(random_surfels(10), CENTER, 3).colors.requires_grad
+        assert not activate_gaussians(random_surfels(10), CENTER, 3).colors.requires_grad
 
 
 def test_twin_gradcheck():
@@ -230,7 +230,7 @@ def test_twin_gradcheck():
 
 
 def test_tangents_are_orthonormal(isa):
-    activated = activate_surfels(random_surfels(50), CENTER, 3)
+    activated = activate_gaussians(random_surfels(50), CENTER, 3)
     u, v = activated.tangent_u, activated.tangent_v
     one, zero = torch.ones(50), torch.zeros(50)
     torch.testing.assert_close((u * u).sum(-1), one)
@@ -240,7 +240,7 @@ def test_tangents_are_orthonormal(isa):
 
 def test_other_dtypes_are_refused():
     with pytest.raises(TypeError, match=r"surfels.means is torch.float64"):
-        activate_surfels(random_surfels(2, dtype=torch.float64), CENTER, 3)
+        activate_gaussians(random_surfels(2, dtype=torch.float64), CENTER, 3)
 
 
 def test_non_contiguous_parameters_and_gradients():
@@ -248,7 +248,7 @@ def test_non_contiguous_parameters_and_gradients():
     strided = Surfels(**{n: v.detach().clone() for n, v in surfels.items()})
     strided.means = strided.means.T.contiguous().T
     strided.requires_grad_()
-    a, b = (outputs_of(activate_surfels(s, CENTER, 3)) for s in (surfels, strided))
+    a, b = (outputs_of(activate_gaussians(s, CENTER, 3)) for s in (surfels, strided))
     upstream = upstream_for(a)
     upstream[0] = upstream[0].T.contiguous().T
     for x, y in zip(gradients(surfels, a, upstream), gradients(strided, b, upstream)):

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from surfel_cases import random_surfels
 
 from rtgs.core.errors import RtgsError
-from rtgs.gaussians.activate import activate_surfels
+from rtgs.gaussians.activate import activate_gaussians
 from rtgs.gaussians.adam import GaussianAdam
 from rtgs.gaussians.channels import ACTIVATIONS, Channel, logit
 from rtgs.gaussians.density import DensityControl, RowPlan, apply_plan, concatenate, select_rows, split_gaussians
@@ -176,7 +176,7 @@ def test_channels_follow_the_parameters_in_declared_order(kind):
     assert copied.channels == made.channels
     assert copied["tint"] is not made["tint"]
     assert made.requires_grad_()["tint"].requires_grad
-    activate_surfels(made, torch.zeros(3), 3).colors.sum().backward()  # a channel is no part of it
+    activate_gaussians(made, torch.zeros(3), 3).colors.sum().backward()  # a channel is no part of it
     assert made["tint"].grad is None
 
 

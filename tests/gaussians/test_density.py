@@ -261,11 +261,11 @@ def test_state_round_trip():
 
 def test_bad_observations_say_what_is_wrong():
     control = control_of([HOT] * 3)
-    with pytest.raises(ValueError, match="4 surfels observed, but the statistics are of 3"):
+    with pytest.raises(ValueError, match="4 Gaussians observed, but the statistics are of 3"):
         control.observe(torch.zeros(4, 2), torch.zeros(4))
     with pytest.raises(ValueError, match=r"signal must be \(N, 2\)"):
         control.observe(torch.zeros(3, 4), torch.zeros(3))
-    with pytest.raises(FloatingPointError, match=r"1 surfels is NaN or inf \(first ids \[2\]\)"):
+    with pytest.raises(FloatingPointError, match=r"1 Gaussians is NaN or inf \(first ids \[2\]\)"):
         control.observe(torch.tensor([[0.0, 0], [0, 0], [0, float("nan")]]), torch.zeros(3))
     with pytest.raises(ValueError, match="scene extent 0"):
         DensityControl(DensitySettings(), 0)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from rtgs.gaussians.activate import activate_surfels
+from rtgs.gaussians.activate import activate_gaussians
 from rtgs.gaussians.initialize import neighbor_distance, points_box, random_points, surfels_from_points
 from rtgs.gaussians.settings import InitSettings
 
@@ -22,7 +22,7 @@ def test_numbers():
     surfels = surfels_from_points(points, colors, InitSettings(), generator())
     assert torch.equal(surfels.means, points)
     assert all(values.requires_grad and values.dtype == torch.float32 for _, values in surfels.items())
-    activated = activate_surfels(surfels, torch.tensor([9.0, 9, 9]), 3)
+    activated = activate_gaussians(surfels, torch.tensor([9.0, 9, 9]), 3)
     torch.testing.assert_close(activated.opacities, torch.full((100,), 0.1))
     torch.testing.assert_close(activated.colors, colors)
     assert ((surfels.quaternions >= 0) & (surfels.quaternions <= 1)).all()

@@ -53,7 +53,7 @@ class Painter:
         alpha = ALPHA * (depth > 0).float()
         image = torch.zeros(3, camera.height, camera.width)
         buffers = RasterBuffers(image, alpha, depth=ALPHA * depth, normal=ALPHA * normal)
-        return RenderedView(camera, image, buffers, specular=torch.full_like(alpha, 0.4))
+        return RenderedView(camera, image, buffers, maps={"specular": torch.full_like(alpha, 0.4)})
 
 
 def seen(angle: float, truth: bool) -> View:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from rtgs.core.cameras import Camera
 from rtgs.gaussians.materials import activate_materials
-from rtgs.gaussians.surfels import ActivatedSurfels, Surfels, activate
+from rtgs.gaussians.surfels import ActivatedGaussians, Surfels, activate
 from rtgs.methods.model import Model
 from rtgs.methods.parts.kinds import surfel_options
 from rtgs.methods.shading.mirror import SHORTEST_NORMAL, SurfacePixels, mirror_rays, pixel_weights, surface_pixels
@@ -120,7 +120,7 @@ class GlassTwin:
         self.fragile |= (length < 0.05) | ((alpha - settings.reflection.smallest_alpha).abs() < 1e-4)
         return flat, (alpha > settings.reflection.smallest_alpha) & (length > SHORTEST_NORMAL)
 
-    def _activated(self, name: str) -> tuple[ActivatedSurfels, Tensor]:
+    def _activated(self, name: str) -> tuple[ActivatedGaussians, Tensor]:
         raw = self.sets[name]
         surfels = activate(raw, self.camera.center, self.method.base.sh_degree(self.step))
         made = activate_materials(raw)

@@ -149,7 +149,7 @@ def test_an_opaque_thing_under_masks_is_left_alone(plain: GlassScene):
     assert method.decisions[-1].what == "no transmittance stage"
     view = views[0]
     rendered = method.render(view.camera, 40, Mode.TRAIN, mask=view.mask)
-    assert rendered.transparent is None
+    assert rendered.maps.get("transparent") is None
     assert "specular" not in {term.name for term in method.losses(rendered, view, 40).terms}
     again = new_glass_method(glass_recipe(), plain)
     again.load(method.state())
@@ -179,7 +179,7 @@ def test_a_mask_of_the_whole_picture_is_none(plain: GlassScene):
     assert method.parts["glass"].mask(covered) is None
     assert method.parts["glass"].mask(view) is view.mask
     assert method.parts["glass"].guide is not None
-    shown = method.render(view.camera, 40, Mode.TRAIN, mask=covered.mask).transparent
+    shown = method.render(view.camera, 40, Mode.TRAIN, mask=covered.mask).maps["transparent"]
     assert shown is not None
     assert torch.equal(shown, method.parts["glass"].guide.surfaces(view.camera).hit)
     everywhere = GlassScene(replace(plain.scene, train=(covered,) * 4), plain.mesh)

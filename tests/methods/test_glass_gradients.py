@@ -47,11 +47,11 @@ def test_image_and_every_gradient_are_those_of_the_twins(case: str):
     assert view.mask is not None
     twin_sets = {part.name: doubled(part.gaussians) for part in method.sets}  # type: ignore[arg-type]
     rendered = method.render(view.camera, STEP, Mode.TRAIN, mask=view.mask)
-    assert rendered.transparent is not None
+    assert rendered.maps.get("transparent") is not None
     grown = settings.transmittance.rim > 0 and settings.transmittance.interface.count > 0
-    assert bool((rendered.transparent & ~view.mask).any()) == grown
-    assert not bool((view.mask & ~rendered.transparent).any())
-    twin = GlassTwin(method, twin_sets, view.camera, STEP).render(rendered.transparent)
+    assert bool((rendered.maps["transparent"] & ~view.mask).any()) == grown
+    assert not bool((view.mask & ~rendered.maps["transparent"]).any())
+    twin = GlassTwin(method, twin_sets, view.camera, STEP).render(rendered.maps["transparent"])
     clear = ~twin.fragile
     assert float(clear.double().mean()) > 0.3
     assert int((clear & view.mask).sum()) > 20
@@ -82,9 +82,9 @@ def test_the_depth_loss_is_that_of_its_definition(form: str):
         method.find("transmittance").gaussians.opacity_logits += 3
     view = made.scene.train[0]
     rendered = method.render(view.camera, STEP, Mode.TRAIN, mask=view.mask)
-    assert rendered.first_bounce is not None
+    assert rendered.kept is not None
     found = {term.name: term.value for term in method.losses(rendered, view, STEP).terms}
-    bounce = rendered.first_bounce
+    bounce = rendered.kept
     depth, alpha, thickness = bounce.depth.detach(), bounce.alpha.detach(), bounce.thickness
     pixels = view.camera.width * view.camera.height
     if form == "per_hit":

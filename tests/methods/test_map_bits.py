@@ -34,5 +34,5 @@ def test_maps_change_no_bit_of_the_image(name: str) -> None:
             whole = method.render(view.camera, 59, Mode.EVALUATE, maps, view.mask)
         assert alone.image.any()
         assert torch.equal(whole.image, alone.image)
-        assert (whole.transparent is None) == (alone.transparent is None)
+        assert (whole.maps.get("transparent") is None) == (alone.maps.get("transparent") is None)
         assert whole.buffers.depth is not None

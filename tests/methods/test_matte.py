@@ -22,8 +22,8 @@ def test_evidence_is_the_share_of_specular_pixels_and_what_tracing_lowers_there(
     diffuse[:, 0, :2] += 0.2
     image[:, 1] = diffuse[:, 1] = 9  # not specular: does not count
     view = SimpleNamespace(image=photo)
-    rendered = SimpleNamespace(image=image, layers=SimpleNamespace(specular=specular, diffuse=diffuse))
-    plain = SimpleNamespace(image=image, layers=SimpleNamespace(specular=0 * specular, diffuse=diffuse))
+    rendered = SimpleNamespace(image=image, layers={"specular": specular, "diffuse": diffuse})
+    plain = SimpleNamespace(image=image, layers={"specular": 0 * specular, "diffuse": diffuse})
     found = gather_evidence([(rendered, view), (plain, view)], 0.15)  # type: ignore[list-item]
     assert found.share == pytest.approx(2 / 40)
     assert found.gain == pytest.approx(0.75)

@@ -112,7 +112,7 @@ def test_a_run_that_loses_every_surfel_stops_and_says_why():
         train_step(method, scene, step)
     with torch.no_grad():
         method.sets[0].gaussians.opacity_logits.fill_(-9)
-    with pytest.raises(RtgsError, match=r"removed all \d+ surfels of set 'base' before step 20: .*min_opacity 0\.05"):
+    with pytest.raises(RtgsError, match=r"removed all \d+ Gaussians of set 'base' before step 20: .*min_opacity 0\.05"):
         train_step(method, scene, 19)
 
 

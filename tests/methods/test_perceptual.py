@@ -101,8 +101,8 @@ def test_the_loss_on_masks_pulls_the_specular_weight_up_to_its_target():
     rendered = method.render(view.camera, 20, Mode.TRAIN)
     terms = {term.name: term.value for term in method.losses(rendered, view, 20).terms}
     assert view.mask is not None
-    assert rendered.specular is not None
-    expected = float(((0.9 - rendered.specular.detach()).clamp_min(0) * view.mask).mean())
+    assert rendered.maps.get("specular") is not None
+    expected = float(((0.9 - rendered.maps["specular"].detach()).clamp_min(0) * view.mask).mean())
     assert terms["specular"] == pytest.approx(expected)
     bare = {term.name for term in method.losses(rendered, made.scene.train[0], 20).terms}
     assert "specular" not in bare

@@ -68,9 +68,9 @@ def test_a_gain_above_one_counts_towards_the_threshold(gain: float, shown: bool)
         method["base"].gaussians.opacity_logits += 3
         layers = method.render(made.scene.test[0].camera, 15, Mode.EVALUATE, RenderOptions(layers=True)).layers
     assert layers is not None
-    assert bool(layers.traced.any()) is shown
+    assert bool(layers["traced"].any()) is shown
     if shown:
-        assert float(layers.traced.float().mean()) > 0.5
+        assert float(layers["traced"].float().mean()) > 0.5
 
 
 def test_rays_are_shared_in_training_alone_and_not_before_the_scene_is_judged(monkeypatch: pytest.MonkeyPatch):

@@ -59,7 +59,7 @@ def test_the_first_stage_is_that_of_the_plain_method_and_the_second_adds_what_it
     assert method.stages == (Stage("diffuse", 0, 15), Stage("reflection", 15, 60))
     assert method.begin(method.stages[0]) == ()
     view = made.scene.train[0]
-    assert method.render(view.camera, 0, Mode.TRAIN).specular is None
+    assert method.render(view.camera, 0, Mode.TRAIN).maps.get("specular") is None
     assert method.sets == (method["base"],)
     method.begin(method.stages[1])
     assert [part.name for part in method.sets] == ["base", "reflection"]
@@ -69,10 +69,10 @@ def test_the_first_stage_is_that_of_the_plain_method_and_the_second_adds_what_it
         rendered = method.render(view.camera, 15, Mode.EVALUATE, RenderOptions(layers=True))
     layers = rendered.layers
     assert layers is not None
-    blended = layers.diffuse * (1 - layers.specular * layers.traced) + layers.reflection
+    blended = layers["diffuse"] * (1 - layers["specular"] * layers["traced"]) + layers["reflection"]
     torch.testing.assert_close(rendered.image, blended, atol=2e-6, rtol=0)
-    assert bool(layers.traced.any())
-    assert float(layers.reflection[:, ~layers.traced].abs().sum()) == 0
+    assert bool(layers["traced"].any())
+    assert float(layers["reflection"][:, ~layers["traced"]].abs().sum()) == 0
 
 
 @pytest.mark.parametrize(("start", "stages"), [(1.0, ["diffuse"]), (0.0, ["reflection"])])
@@ -199,8 +199,8 @@ def test_what_is_not_traced_at_a_test_view_is_the_diffuse_colour():
     with torch.no_grad():
         rendered = method.render(made.scene.test[0].camera, 15, Mode.EVALUATE, RenderOptions(layers=True))
     assert rendered.layers is not None
-    assert not bool(rendered.layers.traced.any())  # k_s starts at 0.001
-    assert torch.equal(rendered.image, rendered.layers.diffuse)
+    assert not bool(rendered.layers["traced"].any())  # k_s starts at 0.001
+    assert torch.equal(rendered.image, rendered.layers["diffuse"])
 
 
 def test_pixels_that_share_a_ray_show_the_colour_that_one_of_their_block_would():
@@ -217,8 +217,10 @@ def test_pixels_that_share_a_ray_show_the_colour_that_one_of_their_block_would()
     def blocks(maps: torch.Tensor) -> torch.Tensor:  # (C, blocks, 4)
         return maps.unfold(1, 2, 2).unfold(2, 2, 2).flatten(3).flatten(1, 2)
 
-    specular, diffuse, color = (blocks(m) for m in (layers.specular[None], layers.diffuse, layers.reflected_color))
-    known = blocks(layers.traced[None].float()).min(dim=2).values[0] == 1
+    specular, diffuse, color = (
+        blocks(m) for m in (layers["specular"][None], layers["diffuse"], layers["reflected_color"])
+    )
+    known = blocks(layers["traced"][None].float()).min(dim=2).values[0] == 1
     # (C, blocks, pixel, whose ray)
     each = diffuse[..., None] + specular[..., None] * (color[:, :, None, :] - diffuse[..., None])
     worst = (each - blocks(shared)[..., None]).abs().amax(dim=(0, 2))[known]  # of a block, by whose ray

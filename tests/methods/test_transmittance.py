@@ -109,7 +109,7 @@ def test_glass_may_have_a_bound_of_its_own(made: GlassScene):
             use(method, replace(recipe, transmittance=replace(recipe.transmittance, max_gain=gain)))
             images.append(method.render(view.camera, 31, Mode.EVALUATE, LAYERS))
     assert torch.equal(images[0].image, images[1].image)
-    inside = images[0].transparent
+    inside = images[0].maps["transparent"]
     assert inside is not None
     changed = (images[0].image != images[2].image).any(0)
     assert not bool(changed[~inside].any())
@@ -134,18 +134,20 @@ def test_image_is_the_sum_of_its_layers_and_only_masks_are_seen_through(made: Gl
     view = made.scene.test[0]
     with torch.no_grad():
         shown = method.render(view.camera, 40, Mode.EVALUATE, LAYERS, view.mask)
-    layers, inside = shown.layers, shown.transparent
+    layers, inside = shown.layers, shown.maps["transparent"]
     assert layers is not None
-    assert layers.transmission is not None
+    assert layers["transmission"] is not None
     assert inside is not None
-    total = layers.diffuse * (1 - layers.specular * layers.traced) + layers.reflection + layers.transmission
+    total = (
+        layers["diffuse"] * (1 - layers["specular"] * layers["traced"]) + layers["reflection"] + layers["transmission"]
+    )
     torch.testing.assert_close(shown.image, total, atol=1e-5, rtol=1e-5)
-    assert float(layers.transmission[:, ~inside].abs().max()) == 0
-    assert float(layers.transmission[:, inside].mean()) > 0.01
+    assert float(layers["transmission"][:, ~inside].abs().max()) == 0
+    assert float(layers["transmission"][:, inside].mean()) > 0.01
     assert method.parts["glass"].guide is not None
     assert torch.equal(inside, method.parts["glass"].guide.surfaces(view.camera).hit)
     assert view.mask is not None
-    given = method.render(view.camera, 40, Mode.EVALUATE, RenderOptions(masks="given"), view.mask).transparent
+    given = method.render(view.camera, 40, Mode.EVALUATE, RenderOptions(masks="given"), view.mask).maps["transparent"]
     assert given is not None
     assert torch.equal(given, view.mask & inside)
 
@@ -166,12 +168,12 @@ def test_without_a_mask_in_the_picture_the_second_stage_is_shown(made: GlassScen
     covered[0, 0] = False  # a mask of the whole picture counts as none
     everywhere = third.render(view.camera, 40, Mode.TRAIN, mask=covered)
     assert bool(torch.isfinite(everywhere.image).all())
-    assert everywhere.transparent is not None
-    assert torch.equal(everywhere.transparent, covered)
+    assert everywhere.maps.get("transparent") is not None
+    assert torch.equal(everywhere.maps["transparent"], covered)
     everywhere.image.sum().backward()
-    unmasked = third.render(
-        view.camera, 40, Mode.TRAIN, mask=None
-    ).transparent  # the silhouette: the object is there all the same
+    unmasked = third.render(view.camera, 40, Mode.TRAIN, mask=None).maps[
+        "transparent"
+    ]  # the silhouette: the object is there all the same
     assert third.parts["glass"].guide is not None
     assert unmasked is not None
     assert torch.equal(unmasked, third.parts["glass"].guide.surfaces(view.camera).hit)
@@ -186,7 +188,7 @@ def test_empty_masks_leave_the_stage_out_and_say_so():
     assert method.decisions[-1].what == "no transmittance stage"
     assert method.decisions[-1].why == "the masks of the training views are empty, or cover all of them"
     view = made.scene.test[0]
-    assert method.render(view.camera, 40, Mode.EVALUATE, LAYERS, view.mask).transparent is None
+    assert method.render(view.camera, 40, Mode.EVALUATE, LAYERS, view.mask).maps.get("transparent") is None
 
 
 def test_a_pane_has_no_second_bounce_and_a_set_behind_it():
@@ -210,8 +212,8 @@ def test_a_pane_has_no_second_bounce_and_a_set_behind_it():
         method.find("transmittance").gaussians.opacity_logits.fill_(-13)
         layers = method.render(view.camera, 40, Mode.EVALUATE, LAYERS, view.mask).layers
     assert layers is not None
-    assert layers.transmission is not None
-    assert float(layers.transmission.abs().max()) == 0
+    assert layers["transmission"] is not None
+    assert float(layers["transmission"].abs().max()) == 0
     whole = new_glass_method(glass_recipe(), flat)
     for stage in whole.stages[:2]:
         whole.begin(stage)

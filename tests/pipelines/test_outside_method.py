@@ -60,6 +60,48 @@ def test_it_trains_through_the_command_line(root: Path, capture: Path, on_path, 
     assert "nothing to do" in capsys.readouterr().err
 
 
+def own(**values: object) -> MethodSettings:
+    return MethodSettings(name=NAME, own=values, loss=LossSettings(normal=0.0))
+
+
+def test_it_has_settings_of_its_own(on_path):
+    method = create_method(own(rate=0.5, near_one=0), small_scene(), small_schedule(30), generator_for(3, "x"))
+    (group,) = method.groups
+    assert isinstance(group, ParameterGroup)
+    assert group.rate.at(0) == 0.5
+    assert "exposure" not in [term.name for term in method.loss.terms]
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"rte": 0.1}, r"method\.own\.rte is no key: method\.own has rate, near_one; did you mean rate\?"),
+        ({"rate": "fast"}, r"method\.own\.rate='fast' must be a number"),
+        ({"rate": True}, r"method\.own\.rate=True must be a number"),
+    ],
+)
+def test_settings_it_does_not_have_are_refused(on_path, values: dict[str, object], message: str):
+    with pytest.raises(RtgsError, match=message):
+        find_method(NAME).own_settings(own(**values))
+
+
+def test_a_method_without_settings_of_its_own_refuses_any():
+    with pytest.raises(RtgsError, match=r"method\.own\.rate: method 2dgs has no settings of its own"):
+        create_method(
+            MethodSettings(name="2dgs", own={"rate": 1.0}), small_scene(), small_schedule(30), generator_for(3, "x")
+        )
+
+
+def test_its_settings_are_checked_before_anything_runs(capture: Path, on_path):  # noqa: F811
+    words = ["scene=capture", f"scene.path={capture}", "preset=smoke", f"method.name='{NAME}'", "method=2dgs"]
+    with pytest.raises(RtgsError, match=r"method\.own\.rate='fast' must be a number"):
+        compose([*words, "+method.own.rate=fast"])
+    slow, fast = (
+        build_graph(*compose([*words, f"+method.own.rate={rate}"])).training[0].fingerprint for rate in (0.01, 0.02)
+    )
+    assert slow != fast
+
+
 def test_a_change_of_its_module_trains_again(capture: Path, tmp_path: Path, monkeypatch):  # noqa: F811
     module = tmp_path / "exposure_method.py"
     monkeypatch.syspath_prepend(str(tmp_path))

@@ -40,7 +40,8 @@ class CountingMethod:
         empty = torch.zeros(HEIGHT, WIDTH)
         buffers = RasterBuffers(image, empty + 1, empty + 2 if options.depth else None, None)
         transparent = mask if self.glass else None
-        return RenderedView(camera, image, buffers, transparent=transparent)
+        maps = {} if transparent is None else {"transparent": transparent}
+        return RenderedView(camera, image, buffers, maps=maps)
 
 
 def view(index: int, *, masked: bool) -> View:

@@ -246,5 +246,5 @@ def _artifacts_are_complete(store: Path, third: list[Path]) -> None:
         with torch.no_grad():
             view = scene.test[0]
             rendered = method.render(view.camera, params.until, Mode.TRAIN, mask=view.mask)
-        assert rendered.transparent is not None
+        assert rendered.maps.get("transparent") is not None
         assert bool(torch.isfinite(rendered.image).all())

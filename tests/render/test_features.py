@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from rtgs.gaussians.activate import activate_surfels
+from rtgs.gaussians.activate import activate_gaussians
 from rtgs.gaussians.channels import MAX_CHANNELS, Channel
 from rtgs.gaussians.ellipsoids import Ellipsoids
 from rtgs.gaussians.harmonics import rgb_to_sh_dc
@@ -45,7 +45,7 @@ def cloud(kind, count: int = 60, seed: int = 0) -> Gaussians:
 
 
 def drawn(gaussians: Gaussians, features: Tensor):
-    shown = activate_surfels(gaussians, CAMERA.center.float(), 0)
+    shown = activate_gaussians(gaussians, CAMERA.center.float(), 0)
     parts = (shown.means, shown.tangent_u, shown.tangent_v, shown.scales, shown.opacities, features, CAMERA)
     return rasterize_ellipsoids(*parts) if isinstance(gaussians, Ellipsoids) else rasterize_surfels(*parts)
 
@@ -157,7 +157,7 @@ def test_composited_normals_and_their_gradients_are_those_of_the_twin(isa: str, 
     upstream = torch.randn(3 + 1 + 3, CAMERA.height, CAMERA.width, generator=torch.Generator().manual_seed(5))
     upstream /= upstream.numel()
     pictures = []
-    for gaussians, rasterize, active in ((made, rasterize_ellipsoids, activate_surfels), (exact, twin, activate)):
+    for gaussians, rasterize, active in ((made, rasterize_ellipsoids, activate_gaussians), (exact, twin, activate)):
         shown = active(gaussians, CAMERA.center.to(gaussians.means), 0)
         layout, features = named_features(gaussians, shown.colors, normals_seen_from=CAMERA.center)
         parts = (shown.means, shown.tangent_u, shown.tangent_v, shown.scales, shown.opacities)

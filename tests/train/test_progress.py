@@ -51,4 +51,4 @@ def test_lines_come_at_most_every_few_seconds_and_at_the_end():
         lines.advance(StepReport(step, 0.5, 10.0, 7))
     lines.close()
     assert len(stream.getvalue().splitlines()) == 1
-    assert stream.getvalue().startswith("diffuse: step 3/3  loss 0.5000  PSNR 10.00 dB  7 surfels")
+    assert stream.getvalue().startswith("diffuse: step 3/3  loss 0.5000  PSNR 10.00 dB  7 Gaussians")

@@ -128,7 +128,7 @@ def test_a_nan_gradient_stops_training_and_names_parameter_and_surfels():
     (bad,) = caught.value.divergence.surfels
     assert (bad.set_name, bad.tensor, bad.count, bad.ids) == ("base", "gradient of log_scales", 2, (3, 8))
     assert "step 0, view 'view_" in str(caught.value)
-    assert "surfel 3: inf, inf" in str(caught.value)
+    assert "Gaussian 3: inf, inf" in str(caught.value)
 
 
 def test_a_nan_densification_signal_stops_training_too():
@@ -140,7 +140,7 @@ def test_a_nan_densification_signal_stops_training_too():
         observe(signal, torch.where(torch.arange(len(weight_sum)) == 5, math.nan, weight_sum))
 
     base.density.observe = poisoned  # type: ignore[method-assign]
-    with pytest.raises(TrainingDiverged, match=r"densification signal or weight sum of 1 surfels .* \[5\]"):
+    with pytest.raises(TrainingDiverged, match=r"densification signal or weight sum of 1 Gaussians .* \[5\]"):
         trainer.run()
 
 

@@ -13,7 +13,7 @@ from rtgs.core.decisions import Decision
 from rtgs.gaussians.initialize import gaussians_from_points
 from rtgs.gaussians.primitives import Gaussians
 from rtgs.gaussians.settings import DensitySettings, McmcSettings
-from rtgs.gaussians.surfels import ActivatedSurfels
+from rtgs.gaussians.surfels import ActivatedGaussians
 from rtgs.methods.parts.gaussian_set import GaussianSet, densified, opacity_reset
 from rtgs.methods.parts.kinds import GaussianKind, RasterRequest
 from rtgs.methods.parts.part import Frame, Part, Raster, Rows
@@ -170,12 +170,12 @@ def composited(gaussians: Gaussians, colors: Tensor) -> Tensor:
     return named_features(gaussians, colors)[1] if gaussians.channels else colors
 
 
-def _joined(base: Rows, appended: Sequence[Rows]) -> tuple[ActivatedSurfels, Tensor]:
+def _joined(base: Rows, appended: Sequence[Rows]) -> tuple[ActivatedGaussians, Tensor]:
     if not appended:
         return base.shape, base.features
     every = (base, *appended)
-    names = [field.name for field in fields(ActivatedSurfels)]
-    shape = ActivatedSurfels(**{name: torch.cat([getattr(rows.shape, name) for rows in every]) for name in names})
+    names = [field.name for field in fields(ActivatedGaussians)]
+    shape = ActivatedGaussians(**{name: torch.cat([getattr(rows.shape, name) for rows in every]) for name in names})
     return shape, torch.cat([rows.features for rows in every])
 
 

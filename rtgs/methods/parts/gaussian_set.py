@@ -8,13 +8,13 @@ import torch
 from torch import Tensor
 
 from rtgs.core.errors import RtgsError
-from rtgs.gaussians.activate import activate_surfels
+from rtgs.gaussians.activate import activate_gaussians
 from rtgs.gaussians.adam import GaussianAdam
 from rtgs.gaussians.density import DensityReport
 from rtgs.gaussians.mcmc import density_control
 from rtgs.gaussians.primitives import Gaussians
 from rtgs.gaussians.settings import DensitySettings, OptimizerSettings
-from rtgs.gaussians.surfels import ActivatedSurfels
+from rtgs.gaussians.surfels import ActivatedGaussians
 from rtgs.train.method import Observation, StepEvent
 
 
@@ -48,9 +48,9 @@ class GaussianSet:
     def _new_optimizer(self) -> GaussianAdam:
         return GaussianAdam(self.gaussians, self._optimizer_settings, self.extent, means_lr_steps=self._means_lr_steps)
 
-    def activated(self, camera_center: Tensor, sh_degree: int) -> ActivatedSurfels:
+    def activated(self, camera_center: Tensor, sh_degree: int) -> ActivatedGaussians:
         """Activated Gaussians as seen from ``camera_center`` (3,) world, SH up to ``sh_degree``."""
-        return activate_surfels(self.gaussians, camera_center, sh_degree)
+        return activate_gaussians(self.gaussians, camera_center, sh_degree)
 
     def tensors(self) -> Iterable[tuple[str, Tensor]]:
         """(name, tensor) of every raw parameter."""
@@ -153,11 +153,11 @@ def densified(
     report = part.densify(generator, after_reset=after_reset)
     if report.total == 0:
         raise RtgsError(
-            f"density control removed all {report.pruned} surfels of set {part.name!r} before step {following}: "
+            f"density control removed all {report.pruned} Gaussians of set {part.name!r} before step {following}: "
             f"every opacity was below method.density.min_opacity {settings.min_opacity}. Lower it, or the "
             "learning rate method.optimizer.opacity_logits; the last checkpoint is intact"
         )
-    detail = f"{report.cloned} cloned, {report.split} split, {report.pruned} pruned, {report.total} surfels"
+    detail = f"{report.cloned} cloned, {report.split} split, {report.pruned} pruned, {report.total} Gaussians"
     return StepEvent("density", part.name, detail)
 
 

@@ -18,17 +18,26 @@ from rtgs.mesh.container import ObjectGuide, ObjectMesh, ObjectSurfaces
 from rtgs.mesh.silhouettes import bounding
 from rtgs.methods.parts.base import BaseSet, composited
 from rtgs.methods.parts.gaussian_set import GaussianSet, densified, opacity_reset
-from rtgs.methods.parts.glass_evidence import glass_faces, masked_views, on_surface, seen_bare
+from rtgs.methods.parts.glass_evidence import glass_faces, has_masks, on_surface, seen_bare
 from rtgs.methods.parts.interface_set import InterfaceSet, interface_surfels
-from rtgs.methods.parts.mirror import Mirror, stored_surfels
-from rtgs.methods.parts.part import Frame, Part, Rows
+from rtgs.methods.parts.mirror import Mirror, Reflected, stored_surfels
+from rtgs.methods.parts.part import Frame, Part, Raster, Rows
 from rtgs.methods.parts.straight_rays import StraightRays
 from rtgs.methods.parts.traced_set import FollowingTree, TracedSet
 from rtgs.methods.parts.transmittance_init import initial_box, random_surfels, rows_inside, take_out
 from rtgs.methods.plans import transmittance_plan
-from rtgs.methods.shading.mirror import SurfacePixels
-from rtgs.methods.shading.straight import GlassPixels, GlassRays, Transmission, glass_pixels, glass_weights, widened
-from rtgs.train.method import Mode, Observation, RenderOptions, Stage, StepEvent
+from rtgs.methods.shading.lights import Light, Traced, lit_view
+from rtgs.methods.shading.mirror import SurfacePixels, reflected_weight
+from rtgs.methods.shading.straight import (
+    GlassPixels,
+    GlassRays,
+    Transmission,
+    glass_pixels,
+    glass_rays,
+    glass_weights,
+    widened,
+)
+from rtgs.train.method import Mode, Observation, RenderedView, RenderOptions, Stage, StepEvent
 from rtgs.train.schedule import (
     densify_ahead,
     densify_due,
@@ -82,8 +91,7 @@ class Glass(Part):
         self._left_out: float | None = None  # why, where the stage was: as :meth:`_reason_against`
         self._points = setup.scene.points
         self._views = setup.scene.train
-        self._masked = any(bool(mask.any()) for _, mask in masked_views(setup.scene.train))
-        mirror.through = self
+        self._masked = has_masks(setup.scene.train)
         if setup.object_mesh is not None and settings.transmittance.enabled:
             self.guide = ObjectGuide(setup.object_mesh)
             frozen = self.plan.start if settings.transmittance.freeze_base else None
@@ -103,11 +111,6 @@ class Glass(Part):
             why = f"the masked object looks opaque: in {share} the photos show its own surface "
             why += "(method.transmittance.opaque_share)"
         return (Decision("no transmittance stage", why),)
-
-    @property
-    def spared(self) -> str:
-        """A scene with masks is not matte: they show its transparent object."""
-        return "the scene has masks of a transparent object" if self._masked else ""
 
     def mask(self, view: View) -> Tensor | None:
         """L_spec acts in masks that bound something, unless the stage was left out."""
@@ -231,6 +234,28 @@ class Glass(Part):
 
     # ---- rendering
 
+    def shade(self, frame: Frame, raster: Raster) -> RenderedView | None:
+        """What the mirror shows, and in transparent objects what straight rays meet."""
+        if not self.begun or self.settings.transmittance.first_bounce == "none":
+            return None
+        mirror, rays = self.mirror, frame.rays
+        glass = self.pixels(frame, mirror.surface(raster.buffers))
+        chosen = mirror.choose(frame, raster.buffers, glass.flat, always=glass.inside)
+        met = mirror.reflect(frame, chosen, glass.flat)
+        reflection, transmission = self.weights(met, glass.inside[chosen.index])
+        passed = self.transmit(frame, glass_rays(glass, chosen.index, rays.center, rays.directions))
+        through = Light("transmission", "transmitted_color", transmission, passed.color)
+        traced = Traced(
+            glass.flat,
+            chosen,
+            met.pixels,
+            (met.light(reflection), through),
+            {"transparent": glass.inside.reshape(frame.camera.height, frame.camera.width)},
+            passed.first_bounce,
+            (*met.observations, *passed.observations),
+        )
+        return lit_view(frame, raster, traced, self.settings.optics.blend)
+
     def appended(self, frame: Frame) -> Rows | None:
         """The interface: it is rasterised with the base set, as its surface in the object's pixels."""
         if self.interface is None:
@@ -238,11 +263,9 @@ class Glass(Part):
         shape = self.interface.activated(frame.camera.center.float(), self.base.sh_degree(frame.step))
         return Rows(shape, composited(self.interface.gaussians, shape.colors))
 
-    def pixels(self, frame: Frame, flat: SurfacePixels) -> GlassPixels | None:
+    def pixels(self, frame: Frame, flat: SurfacePixels) -> GlassPixels:
         """The pixels of the view's mask in training, of the silhouette or of given masks else."""
         settings = self.settings.transmittance
-        if not self.begun or settings.first_bounce == "none":
-            return None
         assert self.guide is not None
         surfaces, mask = self.guide.surfaces(frame.camera), bounding(frame.mask)
         source = "given" if frame.training else frame.options.masks or settings.test_masks
@@ -260,16 +283,15 @@ class Glass(Part):
         """(H, W) bool: the mesh's first surface is one of the object's, not a lid or a label."""
         return surfaces.hit & self._glass[surfaces.triangle.clamp_min(0).long()]
 
-    def weights(
-        self, reflection: Tensor, cosine: Tensor, pixels: SurfacePixels, inside: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """w_r and w_t of the traced pixels, with the S_max and the bound of the object's pixels."""
+    def weights(self, met: Reflected, inside: Tensor) -> tuple[Tensor, Tensor]:
+        """w_r and w_t of the traced pixels, with the S_max and the bound of the object's; ``inside`` (P,) bool."""
         settings, optics = self.settings.transmittance, self.settings.optics
-        optics = optics if settings.max_gain is None else replace(optics, max_gain=settings.max_gain)
         bounded = settings.max_weight > 0 and settings.interface.count > 0
-        return glass_weights(reflection, cosine, pixels, inside, optics, settings.max_weight if bounded else 0.0)
+        cosine, reflection = met.rays.cosine, reflected_weight(met.rays.cosine, met.pixels, optics)
+        optics = optics if settings.max_gain is None else replace(optics, max_gain=settings.max_gain)
+        return glass_weights(reflection, cosine, met.pixels, inside, optics, settings.max_weight if bounded else 0.0)
 
-    def transmit(self, frame: Frame, glass: GlassPixels, rays: GlassRays) -> Transmission:
+    def transmit(self, frame: Frame, rays: GlassRays) -> Transmission:
         """C_t of the traced pixels."""
         assert self.guide is not None
         own = self.transmittance

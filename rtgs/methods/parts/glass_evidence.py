@@ -30,6 +30,11 @@ def masked_views(views: Iterable[View]) -> Iterator[tuple[View, Tensor]]:
     return ((view, mask) for view in views if (mask := bounding(view.mask)) is not None)
 
 
+def has_masks(views: Iterable[View]) -> bool:
+    """Some view's mask shows a transparent object."""
+    return any(bool(mask.any()) for _, mask in masked_views(views))
+
+
 def glass_faces(guide: ObjectGuide, views: Iterable[View], least: float) -> Tensor:
     """(F,) bool: faces of the object's mesh that are masked in at least the share ``least`` of the pixels whose first
     surface on the mesh they are; those that no view shows count as glass.

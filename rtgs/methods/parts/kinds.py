@@ -10,7 +10,7 @@ from torch import Tensor
 from rtgs.core.cameras import Camera
 from rtgs.gaussians.ellipsoids import Ellipsoids
 from rtgs.gaussians.primitives import Gaussians
-from rtgs.gaussians.surfels import ActivatedSurfels, Surfels
+from rtgs.gaussians.surfels import ActivatedGaussians, Surfels
 from rtgs.render.buffers import EllipsoidOptions, RasterBuffers, RasterOptions
 from rtgs.render.ellipsoids import rasterize_ellipsoids
 from rtgs.render.settings import RenderSettings
@@ -31,7 +31,7 @@ class RasterRequest:
     extent: float  # of the scene, world units: near and far are shares of it
 
 
-Rasterize = Callable[[ActivatedSurfels, Tensor, RasterRequest], RasterBuffers]
+Rasterize = Callable[[ActivatedGaussians, Tensor, RasterRequest], RasterBuffers]
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def surfel_options(
     )
 
 
-def _surfels(rows: ActivatedSurfels, features: Tensor, request: RasterRequest) -> RasterBuffers:
+def _surfels(rows: ActivatedGaussians, features: Tensor, request: RasterRequest) -> RasterBuffers:
     return rasterize_surfels(
         rows.means,
         rows.tangent_u,
@@ -81,7 +81,7 @@ def _surfels(rows: ActivatedSurfels, features: Tensor, request: RasterRequest) -
     )
 
 
-def _ellipsoids(rows: ActivatedSurfels, features: Tensor, request: RasterRequest) -> RasterBuffers:
+def _ellipsoids(rows: ActivatedGaussians, features: Tensor, request: RasterRequest) -> RasterBuffers:
     settings = request.settings
     buffers = rasterize_ellipsoids(
         rows.means,

@@ -45,10 +45,10 @@ def gather_evidence(views: Iterable[tuple[RenderedView, View]], specular: float)
     for rendered, view in views:
         layers = rendered.layers
         assert layers is not None
-        where = layers.specular >= specular
+        where = layers["specular"] >= specular
         pixels += where.numel()
         found += int(where.sum())
         with_reflection += float((rendered.image - view.image)[:, where].square().sum())
-        without += float((layers.diffuse - view.image)[:, where].square().sum())
+        without += float((layers["diffuse"] - view.image)[:, where].square().sum())
     gain = 1 - with_reflection / without if without > 0 else 0.0
     return MatteEvidence(found / max(pixels, 1), gain)

@@ -1,13 +1,14 @@
 """The reflection set: one mirror ray per pixel, traced through a set of its own (method.md 3.3, 6.1, 6.2).
 
-image = (1 - k_s) C_d + k_s w_r C_r, and inside transparent objects + k_s w_t C_t of a part that sees through them.
+image = (1 - k_s) C_d + k_s w_r C_r. Parts after this one may use its steps (surface, choose, reflect) for lights of
+their own.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -32,20 +33,18 @@ from rtgs.methods.plans import (
     reflection_plan,
     reflection_reset_due,
 )
+from rtgs.methods.shading.lights import Light, Traced, lit_view
 from rtgs.methods.shading.mirror import (
     MirrorRays,
     SurfacePixels,
     mirror_rays,
     reflected_weight,
     showing_reflection,
-    specular_change,
     surface_pixels,
     surface_there,
 )
-from rtgs.methods.shading.pixel_maps import add_transmission, full_view, specular_layers, take_pixels
-from rtgs.methods.shading.straight import GlassPixels, GlassRays, Transmission, glass_rays
+from rtgs.methods.shading.pixel_maps import take_pixels
 from rtgs.methods.shading.traced_pixels import TracedPixels, choose_pixels
-from rtgs.optics.light import decoded, encoded
 from rtgs.render.buffers import RasterBuffers, TraceOptions
 from rtgs.train.losses import surface_depth
 from rtgs.train.method import Mode, Observation, RenderedView, RenderOptions, Stage, StepEvent
@@ -57,29 +56,6 @@ if TYPE_CHECKING:
     from rtgs.scenes.scene import View
 
 
-class SeeThrough(Protocol):
-    """What the mirror's shading asks of a part for transparent objects."""
-
-    @property
-    def spared(self) -> str:
-        """Why the scene is not judged matte; empty: it is judged."""
-        ...
-
-    def pixels(self, frame: Frame, flat: SurfacePixels) -> GlassPixels | None:
-        """Where this view looks through a transparent object; None: nowhere, or not yet."""
-        ...
-
-    def weights(
-        self, reflection: Tensor, cosine: Tensor, pixels: SurfacePixels, inside: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """w_r and w_t of the traced pixels, from w_r outside the object; ``inside`` (P,) bool."""
-        ...
-
-    def transmit(self, frame: Frame, glass: GlassPixels, rays: GlassRays) -> Transmission:
-        """What straight rays through the object meet."""
-        ...
-
-
 @dataclass(frozen=True)
 class Reflected:
     """What the mirror rays of P traced pixels met."""
@@ -88,6 +64,10 @@ class Reflected:
     rays: MirrorRays
     color: Tensor  # (3, P) C_r
     observations: tuple[Observation, ...]
+
+    def light(self, weight: Tensor) -> Light:
+        """C_r with its ``weight`` w_r, (P,) or (3, P)."""
+        return Light("reflection", "reflected_color", weight, self.color)
 
 
 class Mirror(Part):
@@ -99,22 +79,21 @@ class Mirror(Part):
     Attributes:
         set: the reflection set; None before the stage and in a matte scene.
         plan: when the stage does what.
-        through: of a part for transparent objects; None: there is none.
     """
 
     name = "mirror"
 
-    def __init__(self, setup: Setup, base: BaseSet, stage: str = "reflection") -> None:
-        """``stage``: the one with which this part begins."""
+    def __init__(self, setup: Setup, base: BaseSet, stage: str = "reflection", spared: str = "") -> None:
+        """``stage``: the one with which this part begins; ``spared``: why the scene is not judged matte, "": it is."""
         self.base = base
         self.settings = setup.settings
         self.schedule = setup.schedule
         self.generator = setup.generator
         self.extent = setup.scene.extent
         self.set: TracedSet | None = None
-        self.through: SeeThrough | None = None
         self.plan = reflection_plan(setup.settings.reflection, base.schedule)
         self._stage = stage
+        self._spared = spared
         self._matte: MatteEvidence | None = None
         self._points = setup.scene.points
         self._views = setup.scene.train
@@ -184,41 +163,14 @@ class Mirror(Part):
         """Join the layers; in training only some pixels may be traced, and the image of the others is C_d."""
         if self.set is None:
             return None
-        camera, buffers, blend = frame.camera, raster.buffers, self.settings.optics.blend
-        flat = self._flat_pixels(buffers)
-        glass = None if self.through is None else self.through.pixels(frame, flat)
-        flat = flat if glass is None else glass.flat
-        rays = camera.rays()
-        view = rays.directions.reshape(-1, 3).T
-        chosen = self._choose(frame, flat, buffers, view, glass)
-        met = self._reflect(frame, chosen, flat, rays.origin, view)
-        reflection, transmission = self._weights(met, None if glass is None else glass.inside[chosen.index])
-        light, passed = reflection * decoded(met.color, blend), None
-        if glass is not None:
-            assert self.through is not None
-            passed = self.through.transmit(frame, glass, glass_rays(glass, chosen.index, rays.origin, view))
-            light = light + transmission * decoded(passed.color, blend)
-        change = specular_change(met.pixels, light, chosen.emphasis, blend)
-        shape = (3, camera.height, camera.width)
-        layers = None
-        if frame.options.layers:
-            reflected = encoded(met.pixels.specular * reflection * decoded(met.color, blend), blend)
-            layers = specular_layers(flat, chosen, reflected, met.color, shape)
-            if passed is not None:
-                through = encoded(met.pixels.specular * transmission * decoded(passed.color, blend), blend)
-                layers = add_transmission(layers, chosen, through, passed.color, shape)
-        return RenderedView(
-            camera,
-            full_view(flat.diffuse, chosen, change, shape),
-            buffers,
-            layers,
-            flat.specular.reshape(shape[1:]),
-            None if passed is None else passed.first_bounce,
-            None if glass is None else glass.inside.reshape(shape[1:]),
-            (*raster.observations, *met.observations, *(() if passed is None else passed.observations)),
-        )
+        flat = self.surface(raster.buffers)
+        chosen = self.choose(frame, raster.buffers, flat)
+        met = self.reflect(frame, chosen, flat)
+        lights = [met.light(reflected_weight(met.rays.cosine, met.pixels, self.settings.optics))]
+        traced = Traced(flat, chosen, met.pixels, lights, observations=met.observations)
+        return lit_view(frame, raster, traced, self.settings.optics.blend)
 
-    def _flat_pixels(self, buffers: RasterBuffers) -> SurfacePixels:
+    def surface(self, buffers: RasterBuffers) -> SurfacePixels:
         """Every pixel of the view, flattened."""
         depth = buffers.alpha if buffers.depth is None else buffers.depth  # unused at ratio 1
         surface = surface_depth(depth, buffers.alpha, buffers.median_depth, self.settings.render.depth_ratio)
@@ -232,28 +184,28 @@ class Mirror(Part):
         )
 
     @torch.no_grad()
-    def _choose(
-        self, frame: Frame, flat: SurfacePixels, buffers: RasterBuffers, view: Tensor, glass: GlassPixels | None
+    def choose(
+        self, frame: Frame, buffers: RasterBuffers, flat: SurfacePixels, always: Tensor | None = None
     ) -> TracedPixels:
-        """Which pixels are traced, and which of them share a ray."""
+        """Which pixels are traced, which of them share a ray; ``always`` (H * W,) bool: each by a ray of its own."""
         settings, traced = self.settings.reflection, self.settings.reflection.traced
         if not frame.training or frame.step < self.plan.judged:  # k_s has to tell the mirrors from the rest first
             traced = replace(traced, shared_below=0.0)
         there = surface_there(flat, buffers.alpha.flatten(), settings.smallest_alpha)
         showing = None
         if traced.threshold > 0 or traced.shared_below > 0:
-            showing = showing_reflection(flat, view, self.settings.optics)
-            showing = showing if glass is None else showing.masked_fill(glass.inside, torch.inf)
+            showing = showing_reflection(flat, frame.rays.directions, self.settings.optics)
+            showing = showing if always is None else showing.masked_fill(always, torch.inf)
             showing = showing.reshape(buffers.alpha.shape)
         generator = self.generator if frame.training else None
         return choose_pixels(there.reshape(buffers.alpha.shape), showing, traced, generator)
 
-    def _reflect(
-        self, frame: Frame, chosen: TracedPixels, flat: SurfacePixels, center: Tensor, view: Tensor
-    ) -> Reflected:
+    def reflect(self, frame: Frame, chosen: TracedPixels, flat: SurfacePixels) -> Reflected:
+        """Trace the mirror rays of the chosen pixels."""
         assert self.set is not None
         pixels = take_pixels(flat, chosen.index)
-        rays = mirror_rays(pixels, center, view.index_select(1, chosen.index), self.settings.reflection.sh_direction)
+        view = frame.rays.directions.index_select(1, chosen.index)
+        rays = mirror_rays(pixels, frame.rays.center, view, self.settings.reflection.sh_direction)
         ahead = self.set.density.needs_signal and densify_ahead(self.plan.reflection, frame.step)
         watched = frame.training and ahead
         origins, directions = rays.origins, rays.directions
@@ -265,14 +217,6 @@ class Mirror(Part):
         colors = traced.colors if self._sky is None else traced.colors + (1 - traced.alpha)[:, None] * self._sky
         color = (colors if chosen.shared is None else colors.index_select(0, chosen.shared.ray)).T
         return Reflected(pixels, rays, color, observations)
-
-    def _weights(self, met: Reflected, inside: Tensor | None) -> tuple[Tensor, Tensor]:
-        """w_r and w_t (0 outside transparent objects); ``inside`` (P,) bool: the pixel shows one, None: none does."""
-        reflection = reflected_weight(met.rays.cosine, met.pixels, self.settings.optics)
-        if inside is None:
-            return reflection, torch.zeros(())
-        assert self.through is not None
-        return self.through.weights(reflection, met.rays.cosine, met.pixels, inside)
 
     def trace_options(self, step: int, watched: bool) -> TraceOptions:
         """How mirror rays are traced at ``step``; ``watched``: with the sums that density control needs."""
@@ -318,8 +262,8 @@ class Mirror(Part):
         """Look at some training views; a scene with nothing specular goes on without this part."""
         if self.set is None or not self.plan.start < following == self.plan.judged < self.schedule.total:
             return
-        if self.through is not None and self.through.spared:
-            yield StepEvent("decision", "reflection", f"goes on: {self.through.spared}")
+        if self._spared:
+            yield StepEvent("decision", "reflection", f"goes on: {self._spared}")
             return
         evidence = self._evidence(following)
         if not evidence.is_matte(self.settings.reflection.matte):

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 from torch import Tensor
 
 from rtgs.core.cameras import Camera
 from rtgs.core.decisions import Decision
-from rtgs.gaussians.surfels import ActivatedSurfels
+from rtgs.gaussians.surfels import ActivatedGaussians
 from rtgs.render.buffers import RasterBuffers
 from rtgs.train.method import Mode, Observation, RenderedView, RenderOptions, Stage, StepEvent
 
@@ -34,12 +35,26 @@ class Frame:
         """The view is rendered for a loss."""
         return self.mode is Mode.TRAIN
 
+    @cached_property
+    def rays(self) -> ViewRays:
+        """The rays of all pixels."""
+        found = self.camera.rays()
+        return ViewRays(found.origin, found.directions.reshape(-1, 3).T)
+
+
+@dataclass(frozen=True)
+class ViewRays:
+    """One ray for each of H * W pixels, row by row."""
+
+    center: Tensor  # (3,) world
+    directions: Tensor  # (3, H * W) world, camera-z component 1
+
 
 @dataclass(frozen=True)
 class Rows:
     """Gaussians to rasterise with the base set: M activated ones and what is composited of them."""
 
-    shape: ActivatedSurfels
+    shape: ActivatedGaussians
     features: Tensor  # (M, C), C as the base set's
 
 
@@ -75,8 +90,12 @@ class Part:
         """A stage starts afresh."""
         return ()
 
+    def aim(self, frame: Frame) -> Frame:
+        """The view as this part has it: from another camera, for example."""
+        return frame
+
     def needs(self, frame: Frame) -> RenderOptions:
-        """Maps of the base set that :meth:`shade` reads."""
+        """Maps of the base set that :meth:`shade` and :meth:`finish` read."""
         return RenderOptions()
 
     def appended(self, frame: Frame) -> Rows | None:
@@ -86,6 +105,10 @@ class Part:
     def shade(self, frame: Frame, raster: Raster) -> RenderedView | None:
         """The view from the base set's maps; None: this part leaves it to those before it."""
         return None
+
+    def finish(self, frame: Frame, shaded: RenderedView) -> RenderedView:
+        """The view that some part shaded, changed: what happens in the camera, for example."""
+        return shaded
 
     def step(self, step: int, observations: Mapping[str, Observation]) -> None:
         """Adam on the sets after the backward pass; ``observations`` of the view by the name of the set. The model
@@ -104,4 +127,5 @@ class Part:
         return {}
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
-        """Take over :meth:`state`, and have the sets and groups that the state holds: their tensors follow."""
+        """Take over :meth:`state`, and have the sets and groups that the state holds, with the channels it holds of
+        them: their tensors follow."""

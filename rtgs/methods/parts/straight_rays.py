@@ -13,9 +13,9 @@ from rtgs.methods.parts.base import BaseSet
 from rtgs.methods.parts.part import Frame
 from rtgs.methods.parts.traced_set import FollowingTree, TracedSet, trace_set
 from rtgs.methods.settings import MethodSettings
-from rtgs.methods.shading.straight import GlassRays, Transmission
+from rtgs.methods.shading.straight import FirstBounce, GlassRays, Transmission
 from rtgs.render.buffers import TraceBuffers, TraceOptions
-from rtgs.train.method import FirstBounce, Observation
+from rtgs.train.method import Observation
 
 
 @dataclass(frozen=True)

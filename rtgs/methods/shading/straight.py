@@ -10,7 +10,7 @@ from torch import Tensor
 from rtgs.mesh.container import ObjectSurfaces
 from rtgs.methods.shading.mirror import SHORTEST_NORMAL, SurfacePixels, pixel_weights
 from rtgs.optics.settings import OpticsSettings
-from rtgs.train.method import FirstBounce, Observation
+from rtgs.train.method import Observation
 
 
 @dataclass(frozen=True)
@@ -39,6 +39,19 @@ class GlassRays:
         """Origins at these z-depths and directions, of all rays or of some."""
         directions = self.directions if rows is None else self.directions[rows]
         return self.center + depth[:, None] * directions, directions
+
+
+@dataclass(frozen=True)
+class FirstBounce:
+    """What the first straight rays met, for the loss on their depth (method.md 5.1); R rays that have a back surface.
+
+    Depths count from the first surface, in z-depth units.
+    """
+
+    depth: Tensor  # (R,) Z_1 = sum of w t, with its graph
+    alpha: Tensor  # (R,) A_1, with its graph
+    thickness: Tensor  # (R,) z_2 - z_s, no graph
+    beyond: Tensor | None = None  # (R,) sum of w (t - thickness) over the hits behind the back surface, if asked for
 
 
 @dataclass(frozen=True)

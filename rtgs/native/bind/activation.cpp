@@ -12,17 +12,17 @@ namespace {
 
 void require(const Floats& a, const char* name, size_t count, size_t columns) {
   if (a.size() != count * columns)
-    throw std::invalid_argument(std::string("activate_surfels: ") + name + " holds " + std::to_string(a.size()) +
+    throw std::invalid_argument(std::string("activate_gaussians: ") + name + " holds " + std::to_string(a.size()) +
                                 " numbers, expected " + std::to_string(count) + " x " + std::to_string(columns));
 }
 
 ActivationShape checked_shape(const nb::tuple& center, int degree, const Floats (&raw)[6], size_t count, int threads) {
   const Floats& sh_rest = raw[5];
   if (sh_rest.ndim() != 3 || sh_rest.shape(0) != count || sh_rest.shape(2) != 3)
-    throw std::invalid_argument("activate_surfels: sh_rest must be (N, K, 3)");
+    throw std::invalid_argument("activate_gaussians: sh_rest must be (N, K, 3)");
   const int rest = int(sh_rest.shape(1));
   if (degree < 0 || degree > 3 || (degree + 1) * (degree + 1) - 1 > rest)
-    throw std::invalid_argument("activate_surfels: SH degree " + std::to_string(degree) + " does not fit the " +
+    throw std::invalid_argument("activate_gaussians: SH degree " + std::to_string(degree) + " does not fit the " +
                                 std::to_string(rest) + " stored coefficients (degree 0 .. 3)");
   ActivationShape shape{long(count), degree, rest, int(raw[1].shape(1)), {}, threads < 1 ? 1 : threads};
   for (int k = 0; k < 3; ++k) shape.center[k] = nb::cast<float>(center[k]);
@@ -30,12 +30,12 @@ ActivationShape checked_shape(const nb::tuple& center, int degree, const Floats 
 }
 
 RawSurfels checked_raw(const nb::tuple& raw, size_t& count, Floats (&hold)[6]) {
-  if (raw.size() != 6) throw std::invalid_argument("activate_surfels: six raw parameters expected");
+  if (raw.size() != 6) throw std::invalid_argument("activate_gaussians: six raw parameters expected");
   for (int k = 0; k < 6; ++k) hold[k] = nb::cast<Floats>(raw[k]);
   count = hold[0].ndim() == 2 ? hold[0].shape(0) : 0;
   require(hold[0], "means", count, 3);
   if (hold[1].ndim() != 2 || (hold[1].shape(1) != 2 && hold[1].shape(1) != 3))
-    throw std::invalid_argument("activate_surfels: log_scales must be (N, 2), or (N, 3) of ellipsoids");
+    throw std::invalid_argument("activate_gaussians: log_scales must be (N, 2), or (N, 3) of ellipsoids");
   require(hold[1], "log_scales", count, hold[1].shape(1));
   require(hold[2], "quaternions", count, 4);
   require(hold[3], "opacity_logits", count, 1);
@@ -69,7 +69,7 @@ void activate(const nb::tuple& raw, const nb::tuple& center, int degree, const n
   const Activated to = {a.tangent_u.data(), a.tangent_v.data(), a.scales.data(), a.opacities.data(), a.colors.data()};
   float* keep = saved ? saved->data() : nullptr;
   nb::gil_scoped_release release;
-  RTGS_DISPATCH(activate_surfels, shape, in, to, keep);
+  RTGS_DISPATCH(activate_gaussians, shape, in, to, keep);
 }
 
 void activate_backward(const nb::tuple& raw, const nb::tuple& center, int degree, const Floats& scales,
@@ -80,7 +80,7 @@ void activate_backward(const nb::tuple& raw, const nb::tuple& center, int degree
   checked_raw(gradients, gradient_count, gradient_hold);
   const ActivationShape shape = checked_shape(center, degree, hold, count, threads);
   if (gradient_count != count || gradient_hold[1].size() != hold[1].size() || gradient_hold[5].size() != hold[5].size())
-    throw std::invalid_argument("activate_surfels: gradients must have the shapes of the parameters");
+    throw std::invalid_argument("activate_gaussians: gradients must have the shapes of the parameters");
   const ActivatedArrays a(upstream, count, shape.scales);
   require(scales, "scales", count, shape.scales);
   require(saved, "saved", saved_size(count), 1);
@@ -89,19 +89,19 @@ void activate_backward(const nb::tuple& raw, const nb::tuple& center, int degree
   Floats(&g)[6] = gradient_hold;
   const RawGradients to = {g[0].data(), g[1].data(), g[2].data(), g[3].data(), g[4].data(), g[5].data()};
   nb::gil_scoped_release release;
-  RTGS_DISPATCH(activate_surfels_backward, shape, in, scales.data(), saved.data(), up, to);
+  RTGS_DISPATCH(activate_gaussians_backward, shape, in, scales.data(), saved.data(), up, to);
 }
 
 }  // namespace
 
 void bind_surfels(nb::module_& m) {
   m.def("activation_saved_size", &saved_size, nb::arg("count"), "Floats the forward pass keeps for the backward pass.");
-  m.def("activate_surfels", &activate, nb::arg("raw"), nb::arg("center"), nb::arg("degree"), nb::arg("out"),
+  m.def("activate_gaussians", &activate, nb::arg("raw"), nb::arg("center"), nb::arg("degree"), nb::arg("out"),
         nb::arg("saved").none(), nb::arg("threads"),
         "Fills out = (tangent_u, tangent_v, scales, opacities, colors) from the six raw parameters; saved may be None.");
-  m.def("activate_surfels_backward", &activate_backward, nb::arg("raw"), nb::arg("center"), nb::arg("degree"),
+  m.def("activate_gaussians_backward", &activate_backward, nb::arg("raw"), nb::arg("center"), nb::arg("degree"),
         nb::arg("scales"), nb::arg("saved"), nb::arg("upstream"), nb::arg("gradients"),
-        nb::arg("threads"), "Fills the six gradients from the upstream gradients of activate_surfels' outputs.");
+        nb::arg("threads"), "Fills the six gradients from the upstream gradients of activate_gaussians' outputs.");
 }
 
 }  // namespace rtgs

@@ -282,14 +282,14 @@ void backward(const ActivationShape& shape, const RawSurfels& in, const float* s
 
 }  // namespace
 
-void activate_surfels(const ActivationShape& shape, const RawSurfels& in, const Activated& out, float* saved) {
+void activate_gaussians(const ActivationShape& shape, const RawSurfels& in, const Activated& out, float* saved) {
   if (shape.degree == 0) forward<0>(shape, in, out, saved);
   if (shape.degree == 1) forward<1>(shape, in, out, saved);
   if (shape.degree == 2) forward<2>(shape, in, out, saved);
   if (shape.degree == 3) forward<3>(shape, in, out, saved);
 }
 
-void activate_surfels_backward(const ActivationShape& shape, const RawSurfels& in, const float* scales,
+void activate_gaussians_backward(const ActivationShape& shape, const RawSurfels& in, const float* scales,
                                const float* saved, const ActivatedGradients& up, const RawGradients& out) {
   if (shape.degree == 0) backward<0>(shape, in, scales, saved, up, out);
   if (shape.degree == 1) backward<1>(shape, in, scales, saved, up, out);

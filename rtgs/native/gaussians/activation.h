@@ -51,8 +51,8 @@ constexpr int kSavedFloats = 12, kSavedGroup = 16;
 
 #define RTGS_DECLARE_SURFEL_KERNELS(isa)                                                                            \
   namespace isa {                                                                                                   \
-  void activate_surfels(const ActivationShape&, const RawSurfels&, const Activated&, float* saved /* or null */);   \
-  void activate_surfels_backward(const ActivationShape&, const RawSurfels&, const float* scales, const float* saved, \
+  void activate_gaussians(const ActivationShape&, const RawSurfels&, const Activated&, float* saved /* or null */);   \
+  void activate_gaussians_backward(const ActivationShape&, const RawSurfels&, const float* scales, const float* saved, \
                                  const ActivatedGradients&, const RawGradients&);                                   \
   }
 RTGS_DECLARE_SURFEL_KERNELS(portable)

@@ -1,0 +1,71 @@
+"""From traced lights to the image: C = (1 - k_s) C_d + k_s sum of w C over the lights (method.md 3.3).
+
+A light is what one kind of ray met: light reflected by the surface, light that passed through it. Any part makes
+lights; they are blended here, in the space that ``method.optics.blend`` names, and become layers of their own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from torch import Tensor
+
+from rtgs.methods.parts.part import Frame, Raster
+from rtgs.methods.shading.mirror import SurfacePixels, specular_change
+from rtgs.methods.shading.pixel_maps import full_map, full_view, surface_layers
+from rtgs.methods.shading.traced_pixels import TracedPixels
+from rtgs.optics.light import decoded, encoded
+from rtgs.train.method import Observation, RenderedView
+
+
+@dataclass(frozen=True)
+class Light:
+    """Light that P traced pixels show beside their own colour."""
+
+    name: str  # of its layer
+    color_name: str  # of the layer with the colour alone
+    weight: Tensor  # (P,) or (3, P) w
+    color: Tensor  # (3, P) C, in the encoding of the photos
+
+
+@dataclass(frozen=True)
+class Traced:
+    """What was traced of a view."""
+
+    flat: SurfacePixels  # all H * W pixels
+    chosen: TracedPixels  # P of them
+    pixels: SurfacePixels  # these
+    lights: Sequence[Light]
+    maps: Mapping[str, Tensor] = field(default_factory=dict)  # more maps of the view
+    kept: object = None  # for loss terms
+    observations: tuple[Observation, ...] = ()
+
+
+def sum_of_lights(lights: Sequence[Light], blend: str) -> Tensor:
+    """(3, P) sum of w C, linear light with ``blend`` "linear"."""
+    first, *others = (light.weight * decoded(light.color, blend) for light in lights)
+    return sum(others, first)
+
+
+def lit_view(frame: Frame, raster: Raster, traced: Traced, blend: str) -> RenderedView:
+    """The view with its lights; the image of pixels that were not traced is C_d."""
+    camera, flat, chosen, pixels = frame.camera, traced.flat, traced.chosen, traced.pixels
+    change = specular_change(pixels, sum_of_lights(traced.lights, blend), chosen.emphasis, blend)
+    shape = (3, camera.height, camera.width)
+    layers = None
+    if frame.options.layers:
+        layers = surface_layers(flat, chosen, shape)
+        for light in traced.lights:
+            shown = encoded(pixels.specular * light.weight * decoded(light.color, blend), blend)
+            layers[light.name] = full_map(shown.detach(), chosen, shape)
+            layers[light.color_name] = full_map(light.color.detach(), chosen, shape)
+    return RenderedView(
+        camera,
+        full_view(flat.diffuse, chosen, change, shape),
+        raster.buffers,
+        layers,
+        {"specular": flat.specular.reshape(shape[1:]), **traced.maps},
+        traced.kept,
+        (*raster.observations, *traced.observations),
+    )
