@@ -1,9 +1,8 @@
 """Each step against the lock file that is kept."""
 
-from accept_steps import LOCK_FILE, project
-
 from pipelines.planning.graph import KINDS
 from rtgs.workflow.sources import check_sources
+from tests.pipelines.accept_steps import LOCK_FILE, project
 
 
 def test_no_step_changed_without_a_new_version():

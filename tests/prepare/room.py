@@ -12,6 +12,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
+CALIBRATION = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
 
 
 @dataclass(frozen=True)

@@ -26,8 +26,8 @@ from rtgs.scenes.settings import SceneSettings
 from rtgs.scenes.undistort import Lens
 from tests.prepare import glass_scene, tiny_networks
 from tests.prepare.glass_scene import shots, write_capture
+from tests.prepare.masks.test_run import CLEAN, box_around, marks
 from tests.prepare.room import write_normal_capture
-from tests.prepare.test_masks_run import CLEAN, box_around, marks
 
 SHOTS = shots(8)
 

@@ -12,7 +12,7 @@ from rtgs.core.cameras import Camera
 from rtgs.methods.shading.traced_pixels import tile_order
 from rtgs.render.trace import trace_surfels
 
-from .test_trace_native import BY_RAY, LABELS, everything, native_trace_scene
+from .native_trace_scene import BY_RAY, LABELS, everything, native_trace_scene
 from .trace_scenes import NAMES, OUTPUTS, TraceTensors, all_outputs, output
 
 

@@ -1,11 +1,10 @@
-"""The native tracer's own promises: determinism, threads, the tree, any number of hits, memory, checked arguments."""
+"""The native tracer's own promises: any number of hits, finite results, checked arguments."""
 
 from __future__ import annotations
 
 import math
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,117 +12,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from rtgs.native import core
 from rtgs.render.buffers import TraceOptions
 from rtgs.render.reference import trace as reference_trace
 from rtgs.render.trace import SurfelTree, trace_surfels
 
-from .trace_runs import TraceScene, answer, run_trace
-from .trace_scenes import NAMES, OUTPUTS, TraceTensors, all_outputs, join, output, surfel, with_rays
+from .native_trace_scene import BY_RAY, GEOMETRY, LABELS, everything, native_trace_scene
+from .trace_runs import TraceScene, run_trace
+from .trace_scenes import NAMES, OUTPUTS, TraceTensors, join, output, surfel, with_rays
 
 ROOT = Path(__file__).parents[2]
-GEOMETRY = 5
-
-
-def native_trace_scene(count: int, rays: int, channels: int = 3, seed: int = 0, size: float = 0.15) -> TraceTensors:
-    """Surfels in a ball, rays from a point outside, the last third of them from anywhere inside."""
-    generator = torch.Generator().manual_seed(seed)
-
-    def normal(*shape: int) -> Tensor:
-        return torch.randn(*shape, generator=generator)
-
-    unit = torch.nn.functional.normalize
-    axis = unit(normal(count, 3), dim=1)
-    tangent_u = unit(torch.linalg.cross(normal(count, 3), axis), dim=1)
-    origins = torch.tensor([0.0, 0.0, -4.0]).repeat(rays, 1)
-    origins[2 * rays // 3 :] = 0.5 * normal(rays - 2 * rays // 3, 3)
-    return TraceTensors(
-        normal(count, 3),
-        tangent_u,
-        torch.linalg.cross(axis, tangent_u),
-        size * torch.exp(0.5 * normal(count, 2)),
-        torch.sigmoid(normal(count)),
-        origins,
-        0.7 * normal(rays, 3) - origins,
-        normal(count, channels),
-        normal(count, 3),
-        0.3 * normal(count, 15, 3),
-        torch.zeros(count, 3),
-    )
-
-
-def everything(scene: TraceTensors, tree: SurfelTree | None = None, **changes) -> list[Tensor]:
-    """All outputs, the weight sums and all gradients of a random upstream gradient."""
-    generator = torch.Generator().manual_seed(1)
-    leaves = scene.leaves(torch.float32)
-    positional, named = leaves.arguments()
-    buffers = trace_surfels(*positional, tree=tree, **named, options=all_outputs(**changes))  # type: ignore[misc]
-    outputs = [output(buffers, name) for name in OUTPUTS]
-    upstream = [torch.randn(o.shape, generator=generator) for o in outputs]
-    gradients = torch.autograd.grad(outputs, leaves.all(), upstream)
-    return [*(o.detach() for o in outputs), output(buffers, "weight_sum"), *gradients]
-
-
-BY_RAY = ("by origins", "by directions")
-LABELS = (*OUTPUTS, "weight_sum", *(f"by {name}" for name in NAMES))
-
-
-def assert_same_bits(a: list[Tensor], b: list[Tensor]) -> None:
-    for name, x, y in zip(LABELS, a, b, strict=True):
-        assert torch.equal(x.contiguous().view(torch.int32), y.contiguous().view(torch.int32)), name
-
-
-@pytest.mark.parametrize("size", [0.05, 0.5])
-def test_bits_do_not_depend_on_the_number_of_threads(isa: str, size: float):
-    scene = native_trace_scene(700, 901, 5, size=size)
-    expected = everything(scene)
-    for threads in (2, 5):
-        torch.set_num_threads(threads)
-        assert_same_bits(expected, everything(scene))
-
-
-def test_refit_and_rebuild_give_the_same_bits(isa: str):
-    scene = native_trace_scene(1000, 600)
-    tree = SurfelTree().build(*scene.all()[:GEOMETRY])
-    cost = tree.surface_cost
-    generator = torch.Generator().manual_seed(2)
-    moved = replace(scene, means=scene.means + 0.5 * torch.randn(1000, 3, generator=generator), scales=2 * scene.scales)
-    tree.refit(*moved.all()[:GEOMETRY])
-    assert tree.surface_cost > 1.5 * cost
-    rebuilt = SurfelTree().build(*moved.all()[:GEOMETRY])
-    assert rebuilt.surface_cost < tree.surface_cost
-    assert_same_bits(everything(moved, rebuilt), everything(moved, tree))
-    assert_same_bits(everything(moved, rebuilt), everything(moved, None))
-
-
-def test_coincident_surfels_are_ordered_by_row_in_any_tree(isa: str):
-    scene = native_trace_scene(400, 300, size=0.4)
-    group = torch.arange(400) % 40
-    copies = {name: dict(scene.items())[name][group] for name in ("means", "tangent_u", "tangent_v")}
-    scene = replace(scene, **copies)
-    old = replace(scene, means=scene.means.roll(17, 0) * torch.linspace(0.2, 3, 400)[:, None])
-    aged = SurfelTree().build(*old.all()[:GEOMETRY]).refit(*scene.all()[:GEOMETRY])
-    assert_same_bits(everything(scene), everything(scene, aged))
-
-
-def test_the_order_of_rays_in_the_kernel_changes_no_output_bit(isa: str):
-    scene = native_trace_scene(600, 800)
-    given, ordered = everything(scene, order="given"), everything(scene, order="sorted")
-    for name, a, b in zip(LABELS, given, ordered, strict=True):
-        if name in (*OUTPUTS, *BY_RAY):
-            assert torch.equal(a, b), name
-        else:  # sums over rays: another order, another rounding
-            torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5 * a.abs().max().item(), msg=name)
-    chosen = everything(scene, order="auto")
-    assert any(all(torch.equal(x, y) for x, y in zip(chosen, some, strict=True)) for some in (given, ordered))
-
-
-def test_rays_in_any_company_give_the_same_bits(isa: str):
-    scene = native_trace_scene(1000, 400)
-    whole = everything(scene)
-    some = torch.arange(0, 400, 3)
-    for name, a, b in zip(OUTPUTS, whole, everything(scene.rays(some)), strict=False):
-        assert torch.equal(a[some], b), name
 
 
 @pytest.mark.parametrize("count", [300, 6000])
@@ -257,52 +154,10 @@ def test_any_finite_input_gives_finite_results(isa: str, seed: int):
     assert found[2].any()
 
 
-def test_bits_do_not_depend_on_earlier_calls(isa: str):
-    small, large = native_trace_scene(50, 33), native_trace_scene(900, 1500, 20, seed=1, size=0.4)
-    core.release_trace_memory()
-    first = everything(small)
-    everything(large)
-    assert_same_bits(first, everything(small))
-
-
-def test_python_threads_do_not_disturb_each_other():
-    scenes = [native_trace_scene(400 + 100 * k, 800, 3 + k, seed=k) for k in range(4)]
-    expected = [everything(scene) for scene in scenes]
-    with ThreadPoolExecutor(4) as pool:
-        for _ in range(3):
-            for a, b in zip(expected, pool.map(everything, scenes), strict=True):
-                assert_same_bits(a, b)
-
-
-def test_the_tree_may_change_between_forward_and_backward():
-    scene = native_trace_scene(300, 200)
-    expected = everything(scene)[len(OUTPUTS) + 1 :]
-    tree = SurfelTree().build(*scene.all()[:GEOMETRY])
-    leaves = scene.leaves(torch.float32)
-    positional, named = leaves.arguments()
-    buffers = trace_surfels(*positional, tree=tree, **named, options=all_outputs())  # type: ignore[misc]
-    tree.build(*native_trace_scene(40, 1).all()[:GEOMETRY])
-    generator = torch.Generator().manual_seed(1)
-    outputs = [output(buffers, name) for name in OUTPUTS]
-    upstream = [torch.randn(o.shape, generator=generator) for o in outputs]
-    for name, a, b in zip(NAMES, expected, torch.autograd.grad(outputs, leaves.all(), upstream), strict=True):
-        assert torch.equal(a, b), name
-
-
-def test_a_second_backward_pass_gives_the_same_bits_and_second_derivatives_are_refused():
-    leaves = native_trace_scene(200, 200).leaves(torch.float32)
-    positional, named = leaves.arguments()
-    loss = output(trace_surfels(*positional, **named), "colors").square().sum()  # type: ignore[misc]
-    first = torch.autograd.grad(loss, leaves.means, retain_graph=True)[0]
-    assert torch.equal(first, torch.autograd.grad(loss, leaves.means, retain_graph=True)[0])
-    (gradient,) = torch.autograd.grad(loss, leaves.means, create_graph=True)
-    with pytest.raises(RuntimeError, match="once_differentiable"):
-        (gradient.square().sum() + loss).backward()
-
-
 def test_a_trace_alive_at_exit_ends_quietly():
     script = (
-        "import torch\nfrom tests.render.test_trace_native import native_trace_scene, trace_surfels\n"
+        "import torch\nfrom rtgs.render.trace import trace_surfels\n"
+        "from tests.render.native_trace_scene import native_trace_scene\n"
         "positional, named = native_trace_scene(60, 30).leaves(torch.float32).arguments()\n"
         "buffers = trace_surfels(*positional, **named)"
     )
@@ -325,52 +180,6 @@ def test_only_wanted_gradients_and_outputs_are_made():
     assert torch.equal(found.alpha.detach(), plain.alpha)
 
 
-def test_last_sh_changes_the_direction_gradient_alone(isa: str):
-    scene = native_trace_scene(300, 400)
-    full, last = everything(scene), everything(scene, direction_gradient="last_sh")
-    for name, a, b in zip(LABELS, full, last, strict=True):
-        assert torch.equal(a, b) is (name != "by directions"), name
-    case = TraceScene(scene, all_outputs(direction_gradient="last_sh"))
-    twin = answer(case)
-    found = run_trace(trace_surfels, case, torch.float32, twin.upstream)
-    exact = twin.exact.gradients["directions"]
-    assert (found.gradients["directions"] - exact).abs().max() <= 1e-4 * exact.abs().max()
-    none = everything(scene, direction_gradient="last_sh", sh_degree=0)
-    assert not none[LABELS.index("by directions")].any()
-
-
-@pytest.mark.parametrize("gradient", ["full", "last_sh"])
-def test_raw_directions_for_colours_are_those_of_the_twin(isa: str, gradient: str):
-    scene = native_trace_scene(300, 400)
-    scene = replace(scene, directions=scene.directions * torch.linspace(0.7, 1.4, 400)[:, None])
-    case = TraceScene(scene, all_outputs(sh_direction="raw", direction_gradient=gradient))
-    twin = answer(case)
-    found = run_trace(trace_surfels, case, torch.float32, twin.upstream)
-    colors = twin.exact.outputs["colors"]
-    assert (found.outputs["colors"] - colors)[~twin.flagged].abs().max() <= 1e-5 * colors.abs().max()
-    for name, exact in twin.exact.gradients.items():
-        assert (found.gradients[name] - exact).abs().max() <= 1e-4 * exact.abs().max(), name
-    unit = everything(scene, direction_gradient=gradient)
-    raw = everything(scene, direction_gradient=gradient, sh_direction="raw")
-    same = {name for name, a, b in zip(LABELS, unit, raw, strict=True) if torch.equal(a, b)}
-    assert "alpha" in same
-    assert not {"colors", "by sh_rest", "by directions"} & same
-
-
-@pytest.mark.parametrize(("stored", "asked"), [(0, 3), (3, 3), (8, 3), (15, 0), (15, 1), (15, 2)])
-def test_degrees_of_sh(isa: str, stored: int, asked: int):
-    scene = native_trace_scene(200, 300)
-    case = TraceScene(replace(scene, sh_rest=scene.sh_rest[:, :stored].contiguous()), all_outputs(sh_degree=asked))
-    twin = answer(case)
-    found = run_trace(trace_surfels, case, torch.float32, twin.upstream)
-    colors = twin.exact.outputs["colors"]
-    assert (found.outputs["colors"] - colors)[~twin.flagged].abs().max() <= 1e-5 * colors.abs().max()
-    for name in ("sh_dc", "sh_rest", "directions"):
-        exact = twin.exact.gradients[name]
-        if exact.numel():
-            assert (found.gradients[name] - exact).abs().max() <= 1e-4 * exact.abs().max()
-
-
 def test_nan_upstream_reaches_the_gradient(isa: str):
     """The trainer's guard must see it: nothing replaces it on the way."""
     leaves = native_trace_scene(60, 50, size=1.0).leaves(torch.float32)
@@ -378,13 +187,6 @@ def test_nan_upstream_reaches_the_gradient(isa: str):
     alpha = trace_surfels(*positional, **named).alpha  # type: ignore[misc]
     upstream = torch.where(torch.arange(50) == 7, torch.nan, 0.0)
     assert torch.autograd.grad(alpha, leaves.means, upstream)[0].isnan().any()
-
-
-def test_strided_inputs_and_upstream():
-    scene = native_trace_scene(80, 60)
-    wide = TraceTensors(*(torch.stack((t, t), -1)[..., 0] for t in scene.all()))
-    assert not wide.means.is_contiguous()
-    assert_same_bits(everything(scene), everything(wide))
 
 
 BROKEN = {

@@ -13,7 +13,7 @@ from rtgs.scenes.capture import CaptureError
 from rtgs.scenes.images import read_normals
 from rtgs.scenes.scene import load_scene
 from rtgs.scenes.settings import SceneSettings
-from rtgs.scenes.undistort import Lens, check_lens, undistorted_lens, undistortion_map
+from rtgs.scenes.undistort import Lens, check_lens, project, undistorted_lens, undistortion_map
 
 from .captures import ColmapCapture, pattern, pixel_centers, save_image
 
@@ -144,6 +144,16 @@ def test_the_map_is_exact_where_the_formula_is_known():
     fx, fy, cx, cy = target.params
     expected = np.array([(100.5 - cx) / fx, (40.5 - cy) / fy])
     np.testing.assert_allclose(rays_opencv(np.array([column + 0.5, row + 0.5])), expected, atol=1e-6)
+
+
+def test_projection_follows_the_distortion():
+    lens = Lens("OPENCV", 120, 90, (80.0, 82.0, 61.0, 44.0, 0.05, -0.02, 0.001, 0.002))
+    grid, target = undistortion_map(lens), lens.pinhole()
+    fx, fy, cx, cy = target.params
+    rays = np.array([[(30.5 - cx) / fx, (20.5 - cy) / fy, 1.0]]) * 3
+    np.testing.assert_allclose(project(lens, rays)[0], grid[:, 20, 30] + 0.5, atol=1e-3)
+    plain = Lens("PINHOLE", 120, 90, (80.0, 82.0, 61.0, 44.0))
+    np.testing.assert_allclose(project(plain, np.array([[1.0, 2.0, 4.0]])), [[81.0, 85.0]])
 
 
 def test_spherical_and_implausible_lenses_are_refused_with_advice():

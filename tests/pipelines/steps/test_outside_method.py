@@ -9,9 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from app_cases import QUICK, _in_root, capture, root  # noqa: F401  (fixtures)
 from safetensors.torch import load_file
-from training_cases import small_scene, small_schedule
 
 from pipelines.cli.main import main
 from pipelines.planning.graph import build_graph
@@ -27,8 +25,10 @@ from rtgs.train.parameters import ParameterGroup
 from rtgs.train.seeds import generator_for
 from rtgs.train.settings import LossSettings
 from rtgs.train.trainer import Trainer
+from tests.pipelines.app_cases import QUICK, _in_root, capture, root  # noqa: F401  (fixtures)
+from tests.train.training_cases import small_scene, small_schedule
 
-EXAMPLE = Path(__file__).parents[2] / "examples" / "new_method"
+EXAMPLE = Path(__file__).parents[3] / "examples" / "new_method"
 NAME = "exposure_method:SPEC"
 
 

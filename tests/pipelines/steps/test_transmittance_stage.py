@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from app_cases import QUICK, _in_root, root  # noqa: F401  (fixtures)
 from PIL import Image
 
 from pipelines.cli.main import main
@@ -25,6 +24,7 @@ from rtgs.methods.model import Model
 from rtgs.scenes.canonical import read_scene
 from rtgs.train.method import Mode
 from rtgs.workflow.manifest import Manifest
+from tests.pipelines.app_cases import QUICK, _in_root, root  # noqa: F401  (fixtures)
 
 WIDTH, HEIGHT, VIEWS = 32, 24, 14
 ROWS = ("none", "no_transmittance_gaussians", "no_specular_loss", "no_depth_loss", "no_mesh_guide")

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from app_cases import QUICK, _in_root, capture, root  # noqa: F401  (fixtures)
 
 from pipelines.cli.main import main
 from pipelines.steps import pictures
@@ -16,6 +15,7 @@ from pipelines.steps.pictures import fixed_views, training_pictures
 from rtgs.scenes.scene import load_scene
 from rtgs.scenes.settings import SceneSettings
 from rtgs.workflow import Store
+from tests.pipelines.app_cases import QUICK, _in_root, capture, root  # noqa: F401  (fixtures)
 
 SECOND = ("method.reflection.cells=3", "method.reflection.matte.probation=0", "method.loss.perceptual=0")
 

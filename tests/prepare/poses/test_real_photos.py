@@ -17,7 +17,7 @@ from rtgs.prepare.settings import FeatureSettings, SfmSettings
 from rtgs.scenes.importers.registry import read_capture
 from rtgs.scenes.settings import SceneSettings
 
-DATA = Path(os.environ.get("RTGS_SHARED", Path(__file__).resolve().parents[3] / "shared")) / "data"
+DATA = Path(os.environ.get("RTGS_SHARED", Path(__file__).resolve().parents[4] / "shared")) / "data"
 SMALL = SfmSettings(features=FeatureSettings(max_side=500, max_features=1500))
 
 

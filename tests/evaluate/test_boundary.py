@@ -1,14 +1,17 @@
 """What is told where the third stage begins: rasterised surface and mesh against the true one, silhouettes."""
 
+import json
 import math
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor
 
 from rtgs.core.cameras import Camera
-from rtgs.evaluate.boundary import boundary_scores
+from rtgs.core.errors import RtgsError
+from rtgs.evaluate.boundary import BoundaryRecord, BoundaryScores, boundary_scores
 from rtgs.mesh.container import ObjectMesh
 from rtgs.methods import Mode, RenderedView, RenderOptions
 from rtgs.render.buffers import RasterBuffers
@@ -97,3 +100,15 @@ def test_without_truth_the_silhouettes_are_left_and_only_masks_that_bound_someth
     smaller = ObjectMesh(sphere(0.7, 32), "given", 0.02, flat=False)
     wrong = boundary_scores(Painter(), made, smaller, 10).silhouette_iou  # type: ignore[arg-type]
     assert wrong == pytest.approx(0.47, abs=0.06), "area of the smaller disc, 0.7 squared"
+
+
+def test_scores_at_the_boundary_come_back(tmp_path: Path) -> None:
+    assert BoundaryRecord.read(tmp_path) is None  # of a training without a third stage
+    before = BoundaryScores(0.99, None, None, None, None, 0.1)
+    record = BoundaryRecord(before, BoundaryScores(0.99, 0.9, 0.8, 3.0, 0.99, 0.9))
+    record.write(tmp_path)
+    assert BoundaryRecord.read(tmp_path) == record
+    assert list(json.loads((tmp_path / "boundary.json").read_text())) == ["before", "after"]
+    (tmp_path / "boundary.json").write_text('{"before": {}}')
+    with pytest.raises(RtgsError, match=r"boundary\.json cannot be read as a record"):
+        BoundaryRecord.read(tmp_path)

@@ -1,4 +1,4 @@
-"""The guard itself, on a toy project and on every file of this one. The lock that is kept: test_sources.py."""
+"""The guard itself, on a toy project and on every file of this one. The kept lock: tests/pipelines/test_sources.py."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from accept_steps import ROOT, project
 
 from pipelines.planning.graph import KINDS
 from rtgs.core.errors import RtgsError
 from rtgs.workflow import StepKind
 from rtgs.workflow.closure import SourceTree
 from rtgs.workflow.sources import SourceLock, accept_sources, check_sources
+from tests.pipelines.accept_steps import ROOT, project
 
 HELD_BY_RECIPES = ("rtgs/scenes/data/",)  # captures: the recipe of an import holds the digest of their files
 NOT_READ = (".pyi", ".so", ".pyd", ".pyc")

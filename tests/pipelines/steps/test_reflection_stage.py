@@ -7,7 +7,6 @@ import json
 from pathlib import Path
 
 import pytest
-from app_cases import QUICK, _in_root, capture, root  # noqa: F401  (fixtures)
 
 from pipelines.cli.main import main
 from pipelines.planning.graph import build_graph
@@ -16,6 +15,7 @@ from rtgs.config import compose
 from rtgs.gaussians.materials import has_materials
 from rtgs.gaussians.ply import read_ply
 from rtgs.scenes import canonical
+from tests.pipelines.app_cases import QUICK, _in_root, capture, root  # noqa: F401  (fixtures)
 
 SECOND = ("method.reflection.cells=3", "method.reflection.matte.probation=0", "method.loss.perceptual=0")
 

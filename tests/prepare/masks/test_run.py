@@ -197,7 +197,7 @@ def test_outlines_in_a_few_photos_give_the_others_their_hull(tmp_path):
 
 
 def test_a_pane_is_carried_into_the_scene(tmp_path):
-    from tests.prepare.test_masks_drawn import PANE, shares, true_pane, views_of
+    from tests.prepare.masks.test_drawn import PANE, shares, true_pane, views_of
 
     root = write_capture(tmp_path / "pane", SHOTS)
     views = views_of(glass_scene_lens(), len(SHOTS))
@@ -220,7 +220,7 @@ def test_a_pane_is_carried_into_the_scene(tmp_path):
 
 
 def glass_scene_lens():
-    from tests.prepare.test_masks_drawn import LENSES
+    from tests.prepare.masks.test_drawn import LENSES
 
     return LENSES["pinhole"]
 
@@ -279,7 +279,7 @@ def test_masks_reach_the_training_through_the_command_line(capture, root, weight
 
 def test_photos_without_poses_become_a_table_with_masked_figures(root, weights, tmp_path, capsys):
     """Photos -> poses -> masks from words -> training -> table; then a pane marked on the photos as they were taken."""
-    from tests.prepare.test_masks_drawn import PANE
+    from tests.prepare.masks.test_drawn import PANE
 
     taken = shots(8, 320, 240)
     photos = tmp_path / "my photos"

@@ -10,13 +10,13 @@ import sys
 from pathlib import Path
 
 import pytest
-from accept_steps import PACKAGES, ROOT, project
-from app_cases import QUICK
 from test_transmittance_stage import TINY, write_capture
 
 from pipelines.planning.graph import KINDS, build_graph
 from rtgs.config import compose
 from rtgs.workflow import Step, Store, make_plan
+from tests.pipelines.accept_steps import PACKAGES, ROOT, project
+from tests.pipelines.app_cases import QUICK
 
 CHILD = """
 import json, logging, pickle, sys

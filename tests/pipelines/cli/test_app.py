@@ -18,7 +18,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import yaml
-from app_cases import QUICK, _in_root, capture, root  # noqa: F401  (fixtures)
 from safetensors import SafetensorError
 
 from pipelines.cli.main import main, report_error
@@ -30,6 +29,7 @@ from rtgs.config.words import friendly_overrides
 from rtgs.scenes.settings import SceneSettings
 from rtgs.workflow import Store
 from rtgs.workflow.step import StepFailed
+from tests.pipelines.app_cases import QUICK, _in_root, capture, root  # noqa: F401  (fixtures)
 
 
 @pytest.fixture(scope="module")
