@@ -108,7 +108,7 @@ class BarProgress:
             return
         rate = (report.step - self._first) / max(time.monotonic() - self._began, 1e-9)
         # fits into 80 columns
-        status = f"loss {report.loss:.3f}  {report.psnr:.1f} dB  {report.surfels:,} Gaussians  {rate:.0f}/s"
+        status = f"loss {report.loss:.3f} {report.psnr:.1f} dB {report.surfels:,} Gaussians {rate:.0f}/s"
         self._bar.update(self._task, completed=report.step, status=status)
 
     def note(self, text: str) -> None:

@@ -239,7 +239,7 @@ def test_tangents_are_orthonormal(isa):
 
 
 def test_other_dtypes_are_refused():
-    with pytest.raises(TypeError, match=r"surfels.means is torch.float64"):
+    with pytest.raises(TypeError, match=r"gaussians.means is torch.float64"):
         activate_gaussians(random_surfels(2, dtype=torch.float64), CENTER, 3)
 
 

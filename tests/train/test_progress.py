@@ -38,7 +38,7 @@ def test_the_bar_shows_numbers_and_notes(monkeypatch, total: int, surfels: int, 
     bar.close()
     shown = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", stream.getvalue())
     counts = f"{total // 2}/{total}"
-    for part in ("diffuse", counts, "loss 0.125", "27.5 dB", f"{surfels:,}", "surfels", "/s", "[no] normals"):
+    for part in ("diffuse", counts, "loss 0.125", "27.5 dB", f"{surfels:,}", "Gaussians", "/s", "[no] normals"):
         assert part in shown
     assert "…" not in shown
 

@@ -86,7 +86,7 @@ def test_lines_are_written_where_there_is_no_terminal():
     stream = io.StringIO()
     small_trainer(schedule=small_schedule(20), progress=LineProgress(stream, seconds=0)).run()
     lines = stream.getvalue().splitlines()
-    assert any(line.startswith("diffuse: step 10/20  loss ") and "surfels" in line for line in lines)
+    assert any(line.startswith("diffuse: step 10/20  loss ") and "Gaussians" in line for line in lines)
     assert any(line.startswith("diffuse: step 20/20") and line.endswith("0:00 left") for line in lines)
 
 
@@ -113,7 +113,7 @@ def test_a_nan_pixel_stops_training_names_the_term_and_leaves_the_checkpoint(tmp
     assert all(bool(torch.isfinite(t).all()) for t in newest.tensors.values() if t.is_floating_point())
 
 
-def test_a_nan_gradient_stops_training_and_names_parameter_and_surfels():
+def test_a_nan_gradient_stops_training_and_names_parameter_and_gaussians():
     trainer = small_trainer(schedule=small_schedule())
     surfels = trainer.method.sets[0].gaussians
 
@@ -125,7 +125,7 @@ def test_a_nan_gradient_stops_training_and_names_parameter_and_surfels():
     surfels.log_scales.register_hook(poison)
     with pytest.raises(TrainingDiverged) as caught:
         trainer.run()
-    (bad,) = caught.value.divergence.surfels
+    (bad,) = caught.value.divergence.gaussians
     assert (bad.set_name, bad.tensor, bad.count, bad.ids) == ("base", "gradient of log_scales", 2, (3, 8))
     assert "step 0, view 'view_" in str(caught.value)
     assert "Gaussian 3: inf, inf" in str(caught.value)
