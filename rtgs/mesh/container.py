@@ -245,7 +245,7 @@ class ObjectGuide:
 
     def surfaces(self, camera: Camera) -> ObjectSurfaces:
         """First and second surface along the camera's pixel rays. A pane has no second surface."""
-        key = _camera_key(camera)
+        key = camera_key(camera)
         found = self._cache.pop(key, None)
         if found is None:
             found = self._cast(camera)
@@ -318,6 +318,7 @@ def _spread(found: _Cached, camera: Camera) -> ObjectSurfaces:
     return ObjectSurfaces(*maps, normal.view(3, *shape), triangle.view(shape))
 
 
-def _camera_key(camera: Camera) -> tuple[object, ...]:
+def camera_key(camera: Camera) -> tuple[object, ...]:
+    """What tells the rays of two cameras apart."""
     intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
     return (camera.rotation.numpy().tobytes(), camera.translation.numpy().tobytes(), *intrinsics)

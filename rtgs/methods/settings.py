@@ -8,9 +8,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from rtgs.core.errors import RtgsError
 from rtgs.core.refuse import refuse_bad_numbers, refuse_unknown_words, refuse_unless
 from rtgs.gaussians.settings import DensitySettings, InitSettings, MaterialSettings, OptimizerSettings
-from rtgs.optics.settings import OpticsSettings
+from rtgs.optics.settings import OpticsSettings, WallSettings
 from rtgs.render.settings import RenderSettings
 from rtgs.train.settings import LossSettings, ScheduleSettings
 
@@ -232,6 +233,7 @@ class TransmittanceSettings:
     transmittance_cutoff: float = 1e-4
     alpha_cutoff: float = 1 / 255
     interface: InterfaceSettings = field(default_factory=InterfaceSettings)
+    wall: WallSettings = field(default_factory=WallSettings, metadata={"recipe": "unless", "value": WallSettings()})
     init: InitSettings = field(default_factory=_transmittance_init)
     density: DensitySettings = field(default_factory=_reflection_density)
 
@@ -244,6 +246,12 @@ class TransmittanceSettings:
         for name in ("densify_every", "sh_every", "cells", "per_cell", "rebuild_every", "most_hits"):
             value = getattr(self, name)
             refuse_unless(value >= 1, f"method.transmittance.{name}", value, "at least 1")
+        inner = self.wall.light == "fresnel" and self.wall.bounces > 0
+        if inner and self.first_bounce != "transmittance":
+            raise RtgsError(
+                f"method.transmittance.wall.bounces={self.wall.bounces} follows light through the transmittance set, "
+                f"and method.transmittance.first_bounce={self.first_bounce} has none: set bounces to 0"
+            )
         every = self.opacity_reset_every
         refuse_unless(every >= 0, "method.transmittance.opacity_reset_every", every, "at least 0 (0: never)")
 
@@ -265,3 +273,10 @@ class MethodSettings:
     paper_schedule: ScheduleSettings = field(default_factory=ScheduleSettings)  # preset=paper takes this one
     # Numbers that only this method has: :attr:`rtgs.methods.spec.MethodSpec.own` says which, and checks them.
     own: dict[str, Any] = field(default_factory=dict, metadata={"recipe": "unless", "value": {}})
+
+    def __post_init__(self) -> None:
+        if self.transmittance.wall.light == "fresnel" and self.optics.blend != "linear":
+            raise RtgsError(
+                "method.transmittance.wall.light=fresnel gives shares of linear light, but "
+                f"method.optics.blend={self.optics.blend}: set it to linear"
+            )

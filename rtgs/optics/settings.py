@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
-from rtgs.core.refuse import refuse_unknown_words
+from rtgs.core.refuse import refuse_bad_numbers, refuse_unknown_words, refuse_unless
 
 Weight = Literal["microfacet", "literal", "split_sum", "envgs"]
 Remap = Literal["pbrt", "none"]
@@ -46,3 +46,22 @@ class OpticsSettings:
     def at_most_one(self) -> bool:
         """Whether w_r can never exceed 1: energy is conserved."""
         return self.weight in ("split_sum", "envgs") or (self.weight == "microfacet" and 0 < self.max_gain <= 1)
+
+
+@dataclass(frozen=True)
+class WallSettings:
+    """The walls of transparent objects: which share of the light they reflect (docs/glass_light.md)."""
+
+    # "learned": k_s, roughness and f0 of each surfel, as the paper; "fresnel": thin clear glass, R = 2 F / (1 + F).
+    light: Literal["learned", "fresnel"] = "learned"
+    index: float = 1.5  # of refraction, at the start; window glass 1.52, borosilicate 1.47
+    index_rate: float = 0.0  # of Adam, for the whole object; 0: the index stays
+    bounces: int = 1  # reflections inside the object that are followed; 0: none
+    cover: float = 0.9  # a composited k_s from which on a pixel is all glass: what L_spec asks of the interface
+
+    def __post_init__(self) -> None:
+        refuse_unknown_words(self, "method.transmittance.wall")
+        refuse_bad_numbers(self, "method.transmittance.wall")
+        refuse_unless(1.05 <= self.index <= 2.5, "method.transmittance.wall.index", self.index, "between 1.05 and 2.5")
+        refuse_unless(self.bounces >= 0, "method.transmittance.wall.bounces", self.bounces, "at least 0 (0: none)")
+        refuse_unless(0 < self.cover <= 1, "method.transmittance.wall.cover", self.cover, "above 0 and at most 1")

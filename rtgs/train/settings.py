@@ -5,9 +5,10 @@ Steps count from 0. A stage boundary "from" is the first step at which something
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
+from rtgs.core.recipe import UNLESS_DEFAULT
 from rtgs.core.refuse import refuse_bad_numbers, refuse_unknown_words, refuse_unless
 
 MonoNormalForm = Literal["cosine", "envgs"]
@@ -26,6 +27,8 @@ class LossSettings:
 
     l1: float = 0.8
     dssim: float = 0.2
+    # Where a photo is at its brightest value the image may be brighter: windows are, and the sensor stops at 1.
+    clipped: bool = field(default=False, metadata=UNLESS_DEFAULT)
     normal: float = 0.05  # 2DGS 0.05; RT-GS and EnvGS 0.04
     normal_start: float = 7 / 30  # 2DGS: from 7,000 of 30,000; EnvGS: from 0
     normal_inverse_depth: bool = False  # EnvGS: weight by 1 - (d - p1)/(p99 - p1), clipped, detached

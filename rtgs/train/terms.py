@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+import torch
 from torch import Tensor
 
 from rtgs.core.decisions import Decision
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from rtgs.train.settings import LossSettings
 
 NO_MAPS = RenderOptions()
+BRIGHTEST = 254.5 / 255  # a photo's value from which on the light may have been more
 
 TermValue = Callable[[RenderedView, "View"], Tensor | None]
 """From a rendered view and the photo to the unweighted scalar; None: this view gives the term nothing to act on."""
@@ -77,6 +79,7 @@ class LossTable:
     l1: float
     dssim: float
     terms: tuple[LossTerm, ...] = ()
+    clipped: bool = False  # what a photo cannot show is no error: see :func:`as_the_sensor`
 
     def needs(self, step: int) -> RenderOptions:
         """The maps that the terms of ``step`` read, and no others."""
@@ -87,7 +90,8 @@ class LossTable:
 
     def evaluate(self, rendered: RenderedView, view: View, step: int) -> LossValues:
         """The weighted sum of what acts at ``step``."""
-        photometric = photometric_loss(rendered.image, view.image, self.l1, self.dssim)
+        image = as_the_sensor(rendered.image, view.image) if self.clipped else rendered.image
+        photometric = photometric_loss(image, view.image, self.l1, self.dssim)
         first = (LossValue("l1", photometric.l1, self.l1), LossValue("dssim", photometric.dssim, self.dssim))
         found = LossValues(photometric.total, first)
         for term in self.terms:
@@ -97,12 +101,17 @@ class LossTable:
 
     def plus(self, terms: Iterable[LossTerm]) -> LossTable:
         """With more terms behind those that are there."""
-        return LossTable(self.l1, self.dssim, (*self.terms, *terms))
+        return replace(self, terms=(*self.terms, *terms))
+
+
+def as_the_sensor(image: Tensor, photo: Tensor) -> Tensor:
+    """(3, H, W) the image, no brighter than 1 where the photo is at its brightest value."""
+    return torch.where(photo >= BRIGHTEST, image.clamp_max(1), image)
 
 
 def table_of(settings: LossSettings, terms: Iterable[LossTerm]) -> LossTable:
     """The table with the photometric weights of the settings."""
-    return LossTable(settings.l1, settings.dssim, tuple(terms))
+    return LossTable(settings.l1, settings.dssim, tuple(terms), settings.clipped)
 
 
 def term_start(name: str, weight: float, share: float, total: int, method: str) -> int | Decision:

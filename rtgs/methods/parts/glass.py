@@ -22,9 +22,10 @@ from rtgs.methods.parts.glass_evidence import glass_faces, has_masks, on_surface
 from rtgs.methods.parts.interface_set import InterfaceSet, interface_surfels
 from rtgs.methods.parts.mirror import Mirror, Reflected, stored_surfels
 from rtgs.methods.parts.part import Frame, Part, Raster, Rows
-from rtgs.methods.parts.straight_rays import StraightRays
+from rtgs.methods.parts.straight_rays import FarWall, StraightRays
 from rtgs.methods.parts.traced_set import FollowingTree, TracedSet
 from rtgs.methods.parts.transmittance_init import initial_box, random_surfels, rows_inside, take_out
+from rtgs.methods.parts.wall_light import InnerRays, WallLight
 from rtgs.methods.plans import transmittance_plan
 from rtgs.methods.shading.lights import Light, Traced, lit_view
 from rtgs.methods.shading.mirror import SurfacePixels, reflected_weight
@@ -38,6 +39,7 @@ from rtgs.methods.shading.straight import (
     widened,
 )
 from rtgs.train.method import Mode, Observation, RenderedView, RenderOptions, Stage, StepEvent
+from rtgs.train.parameters import ParameterGroup
 from rtgs.train.schedule import (
     densify_ahead,
     densify_due,
@@ -66,6 +68,7 @@ class Glass(Part):
     Attributes:
         guide: of the object's mesh; None: without one.
         transmittance, interface: the sets; None before the stage, and where settings leave them out.
+        wall: how its walls reflect; None: by learned weights.
         begun: the stage has begun.
     """
 
@@ -83,6 +86,7 @@ class Glass(Part):
         self.guide: ObjectGuide | None = None
         self.transmittance: TracedSet | None = None
         self.interface: InterfaceSet | None = None
+        self.wall: WallLight | None = None
         self.begun = False
         self._stage = stage
         self._from_base = False  # the transmittance set was taken from the base set
@@ -100,6 +104,10 @@ class Glass(Part):
     @property
     def sets(self) -> tuple[GaussianSet, ...]:
         return tuple(each for each in (self.transmittance, self.interface) if each is not None)
+
+    @property
+    def groups(self) -> tuple[ParameterGroup, ...]:
+        return () if self.wall is None or self.wall.group is None else (self.wall.group,)
 
     @property
     def decisions(self) -> tuple[Decision, ...]:
@@ -132,11 +140,18 @@ class Glass(Part):
         self.begun = True
         mesh, settings = self.guide.mesh, self.settings.transmittance
         self._glass = glass_faces(self.guide, self._views, settings.interface.masked_share)
+        self._put_walls()
         kept = self._seen_bare(stage.from_step)  # before the interface hides what is in the object
         if settings.interface.count > 0:
             yield self._add_interface(mesh)
         if settings.first_bounce == "transmittance":
             yield self._add_transmittance(mesh, kept)
+
+    def _put_walls(self) -> None:
+        """Walls that reflect as thin glass does, where the settings ask for them."""
+        assert self.guide is not None
+        walls = self.settings.transmittance.wall
+        self.wall = WallLight(walls, self.guide, self._glass) if walls.light == "fresnel" else None
 
     def _add_interface(self, mesh: ObjectMesh) -> StepEvent:
         gaussians = self.base.set.gaussians
@@ -241,10 +256,14 @@ class Glass(Part):
         mirror, rays = self.mirror, frame.rays
         glass = self.pixels(frame, mirror.surface(raster.buffers))
         chosen = mirror.choose(frame, raster.buffers, glass.flat, always=glass.inside)
-        met = mirror.reflect(frame, chosen, glass.flat)
+        straight = glass_rays(glass, chosen.index, rays.center, rays.directions)
+        inner = None
+        if self.wall is not None:
+            inner = self.wall.inner_rays(frame.camera, straight, chosen.index[straight.rows])
+        met = mirror.reflect(frame, chosen, glass.flat, None if inner is None else inner.leaving)
         reflection, transmission = self.weights(met, glass.inside[chosen.index])
-        passed = self.transmit(frame, glass_rays(glass, chosen.index, rays.center, rays.directions))
-        through = Light("transmission", "transmitted_color", transmission, passed.color)
+        passed = self.transmit(frame, straight, inner, met.others)
+        through = Light("transmission", "transmitted_color", transmission, passed.color, passed.parts)
         traced = Traced(
             glass.flat,
             chosen,
@@ -276,8 +295,15 @@ class Glass(Part):
         else:
             inside = mask & surfaces.hit  # method.md 6.3: where the ray misses the mesh nothing is transmitted
         inside = widened(inside, settings.rim if settings.interface.count > 0 else 0)
-        glass = self.on_glass(surfaces)
-        return glass_pixels(flat, surfaces, inside, glass, first_surface=settings.first_surface, normal=settings.normal)
+        made = glass_pixels(
+            flat,
+            surfaces,
+            inside,
+            self.on_glass(surfaces),
+            first_surface=settings.first_surface,
+            normal=settings.normal,
+        )
+        return made if self.wall is None else self.wall.on_glass(made, made.known)
 
     def on_glass(self, surfaces: ObjectSurfaces) -> Tensor:
         """(H, W) bool: the mesh's first surface is one of the object's, not a lid or a label."""
@@ -288,11 +314,15 @@ class Glass(Part):
         settings, optics = self.settings.transmittance, self.settings.optics
         bounded = settings.max_weight > 0 and settings.interface.count > 0
         cosine, reflection = met.rays.cosine, reflected_weight(met.rays.cosine, met.pixels, optics)
+        if self.wall is not None:
+            return self.wall.weights(reflection, cosine, inside.nonzero()[:, 0])
         optics = optics if settings.max_gain is None else replace(optics, max_gain=settings.max_gain)
         return glass_weights(reflection, cosine, met.pixels, inside, optics, settings.max_weight if bounded else 0.0)
 
-    def transmit(self, frame: Frame, rays: GlassRays) -> Transmission:
-        """C_t of the traced pixels."""
+    def transmit(
+        self, frame: Frame, rays: GlassRays, inner: InnerRays | None = None, surroundings: Tensor | None = None
+    ) -> Transmission:
+        """C_t of the traced pixels; ``surroundings``: what the rays met that leave the object after ``inner`` paths."""
         assert self.guide is not None
         own = self.transmittance
         straight = StraightRays(
@@ -305,7 +335,9 @@ class Glass(Part):
             frame.training and self._depth_loss_on(frame.step),
             frame.training and own is not None and self._watching(own, frame.step),
         )
-        return straight.transmit(frame, rays)
+        if inner is None or surroundings is None or self.wall is None:
+            return straight.transmit(frame, rays)
+        return straight.transmit(frame, rays, FarWall(inner, surroundings, self.wall.index))
 
     def _own_degree(self, step: int) -> int:
         """SH degree of the transmittance set: grown on its own clock, but never below what it came with."""
@@ -361,6 +393,8 @@ class Glass(Part):
         self.begun = _BEGUN in state
         self._from_base = self.begun and bool(state[_BEGUN])
         self._glass = state[_GLASS].bool() if self.begun else self._glass
+        if self.begun:
+            self._put_walls()
         if _LEFT_OUT in state and self._left_out is None:
             self._leave_out(float(state[_LEFT_OUT]))
         own = stored_surfels(state, "transmittance")

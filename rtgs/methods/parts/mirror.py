@@ -64,6 +64,7 @@ class Reflected:
     rays: MirrorRays
     color: Tensor  # (3, P) C_r
     observations: tuple[Observation, ...]
+    others: Tensor | None = None  # (M, 3) colours that another part's rays met
 
     def light(self, weight: Tensor) -> Light:
         """C_r with its ``weight`` w_r, (P,) or (3, P)."""
@@ -200,8 +201,14 @@ class Mirror(Part):
         generator = self.generator if frame.training else None
         return choose_pixels(there.reshape(buffers.alpha.shape), showing, traced, generator)
 
-    def reflect(self, frame: Frame, chosen: TracedPixels, flat: SurfacePixels) -> Reflected:
-        """Trace the mirror rays of the chosen pixels."""
+    def reflect(
+        self,
+        frame: Frame,
+        chosen: TracedPixels,
+        flat: SurfacePixels,
+        more: tuple[Tensor, Tensor] | None = None,
+    ) -> Reflected:
+        """Trace the mirror rays of the chosen pixels, and ``more`` rays of another part: origins, directions (M, 3)."""
         assert self.set is not None
         pixels = take_pixels(flat, chosen.index)
         view = frame.rays.directions.index_select(1, chosen.index)
@@ -211,12 +218,15 @@ class Mirror(Part):
         origins, directions = rays.origins, rays.directions
         if chosen.shared is not None:
             origins, directions = (rows.index_select(0, chosen.shared.own) for rows in (origins, directions))
-        options = self.trace_options(frame.step, watched)
+        options, own = self.trace_options(frame.step, watched), len(origins)
+        if more is not None:
+            origins, directions = torch.cat((origins, more[0])), torch.cat((directions, more[1]))
         traced, observations = self.set.trace(origins, directions, options, watched=watched)
         assert traced.colors is not None
         colors = traced.colors if self._sky is None else traced.colors + (1 - traced.alpha)[:, None] * self._sky
+        colors, others = (colors, None) if more is None else (colors[:own], colors[own:])
         color = (colors if chosen.shared is None else colors.index_select(0, chosen.shared.ray)).T
-        return Reflected(pixels, rays, color, observations)
+        return Reflected(pixels, rays, color, observations, others)
 
     def trace_options(self, step: int, watched: bool) -> TraceOptions:
         """How mirror rays are traced at ``step``; ``watched``: with the sums that density control needs."""

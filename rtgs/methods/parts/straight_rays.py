@@ -12,10 +12,27 @@ from rtgs.mesh.container import ObjectMesh
 from rtgs.methods.parts.base import BaseSet
 from rtgs.methods.parts.part import Frame
 from rtgs.methods.parts.traced_set import FollowingTree, TracedSet, trace_set
+from rtgs.methods.parts.wall_light import InnerRays
 from rtgs.methods.settings import MethodSettings
+from rtgs.methods.shading.inner import LINEAR, TracedLeg, far_wall, inner_light
 from rtgs.methods.shading.straight import FirstBounce, GlassRays, Transmission
+from rtgs.optics.light import decoded, encoded
 from rtgs.render.buffers import TraceBuffers, TraceOptions
 from rtgs.train.method import Observation
+
+
+@dataclass(frozen=True)
+class FarWall:
+    """The wall behind the contents, where it is mirrored light's turning point."""
+
+    inner: InnerRays
+    surroundings: Tensor  # (M, 3) encoded colours that the leaving rays met
+    index: Tensor | float  # of refraction
+
+
+def _of_pixels(rays: GlassRays, values: Tensor) -> Tensor:
+    """(3, P) values (R, 3) of the rays, 0 in other traced pixels."""
+    return torch.zeros(3, rays.count).index_copy(1, rays.rows, values.T)
 
 
 @dataclass(frozen=True)
@@ -38,16 +55,58 @@ class StraightRays:
     measured: bool
     watched: bool
 
-    def transmit(self, frame: Frame, rays: GlassRays) -> Transmission:
-        """C_t of the traced pixels: what the first bounce meets, and behind the object the second."""
+    def transmit(self, frame: Frame, rays: GlassRays, wall: FarWall | None = None) -> Transmission:
+        """C_t of the traced pixels: what the first bounce meets, and behind the object the second.
+
+        ``wall``: the object's far wall reflects light as well; None: it lets all pass.
+        """
         degree = self.base.sh_degree(frame.step)
         first, observations = self._first_bounce(rays, degree)
         assert first.colors is not None
-        color = first.colors
+        color, parts = first.colors, {}
         if self.settings.transmittance.second_bounce != "none" and not self.mesh.flat:
-            color = self._second_bounce(rays, first, color, degree)
-        full = torch.zeros(3, rays.count).index_copy(1, rays.rows, color.T)
-        return Transmission(full, self._depths(rays, first) if self.measured else None, observations)
+            rows, behind = self._behind(rays, first, degree)
+            left = 1 - first.alpha
+            if wall is not None:
+                color, parts = self._over_wall(first, left, rows, behind, wall)
+            elif self.settings.transmittance.compositing == "over":
+                color = color.index_add(0, rows, left[rows, None] * behind)
+            else:
+                color = color.index_add(0, rows, behind)
+        if not frame.options.layers:
+            parts = {}
+        full, *lights = (_of_pixels(rays, each) for each in (color, *parts.values()))
+        depths = self._depths(rays, first) if self.measured else None
+        return Transmission(full, depths, observations, dict(zip(parts, lights, strict=True)))
+
+    def _over_wall(
+        self, first: TraceBuffers, left: Tensor, rows: Tensor, behind: Tensor, wall: FarWall
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """(R, 3) the first bounce's colour over what the far wall passes and mirrors; and these parts of its light."""
+        assert first.colors is not None
+        passing = decoded(torch.zeros_like(first.colors).index_add(0, rows, behind), LINEAR)
+        arriving = inner_light(wall.inner.paths, self._legs(wall), wall.index)
+        mirrored = far_wall(passing, arriving, wall.inner.rows, wall.inner.paths.cosine, wall.index)
+        color = first.colors + left[:, None] * encoded(mirrored, LINEAR)
+        with torch.no_grad():
+            through = far_wall(passing, 0 * arriving, wall.inner.rows, wall.inner.paths.cosine, wall.index)
+            parts = {"inner": left[:, None] * (mirrored - through), "behind": left[:, None] * through}
+            parts["contents"] = (decoded(color, LINEAR) - parts["inner"] - parts["behind"]).clamp_min(0)
+        return color, parts
+
+    def _legs(self, wall: FarWall) -> list[TracedLeg]:
+        """What was traced along the legs inside the object: its contents, and what the leaving rays met."""
+        assert self.own is not None
+        legs = wall.inner.paths.legs
+        origins, directions, lengths = (
+            torch.cat([getattr(leg, name) for leg in legs]) for name in ("origin", "direction", "length")
+        )
+        start = self.settings.transmittance.offset * self.base.extent
+        options = self._options(start, lengths.clamp_min(2 * start), self.own_degree, False)
+        inside, _ = self.own.trace(origins, directions, options, watched=False)
+        assert inside.colors is not None
+        values = (wall.inner.by_leg(each) for each in (inside.colors, inside.alpha, wall.surroundings))
+        return [TracedLeg(*each) for each in zip(*values, strict=True)]
 
     def _first_bounce(self, rays: GlassRays, degree: int) -> tuple[TraceBuffers, tuple[Observation, ...]]:
         """Through the transmittance set, or through the base set inside the object."""
@@ -63,12 +122,12 @@ class StraightRays:
         options = replace(self._options(start, bound, self.own_degree, depth), weight_sum=self.watched)
         return self.own.trace(origins, directions, options, watched=self.watched)
 
-    def _second_bounce(self, rays: GlassRays, first: TraceBuffers, color: Tensor, degree: int) -> Tensor:
-        """(R, 3) the first bounce's colour and, composited, what the base set shows behind the object."""
+    def _behind(self, rays: GlassRays, first: TraceBuffers, degree: int) -> tuple[Tensor, Tensor]:
+        """(K,) the rays that go on behind the object, and (K, 3) what the base set shows them there."""
         settings = self.settings.transmittance
-        left = 1 - first.alpha
-        over = settings.compositing == "over"
-        rows = (left.detach() > settings.opaque).nonzero()[:, 0] if over else torch.arange(len(left))
+        left = 1 - first.alpha.detach()
+        every = settings.compositing != "over"
+        rows = torch.arange(len(left)) if every else (left > settings.opaque).nonzero()[:, 0]
         back = rays.far
         if settings.second_bounce == "first_bounce":
             assert first.depth is not None
@@ -79,7 +138,7 @@ class StraightRays:
         with torch.set_grad_enabled(torch.is_grad_enabled() and settings.second_bounce_gradient):
             second = self._trace_base(origins, directions, options).colors
         assert second is not None
-        return color.index_add(0, rows, left[rows, None] * second if over else second)
+        return rows, second
 
     def _depths(self, rays: GlassRays, first: TraceBuffers) -> FirstBounce:
         """Depths of the rays that have a second surface; with ``per_hit`` also what lies behind it."""

@@ -27,6 +27,9 @@ class Light:
     color_name: str  # of the layer with the colour alone
     weight: Tensor  # (P,) or (3, P) w
     color: Tensor  # (3, P) C, in the encoding of the photos
+    parts: Mapping[str, Tensor] = field(
+        default_factory=dict
+    )  # (3, P) linear light: C by where it is from
 
 
 @dataclass(frozen=True)
@@ -60,6 +63,9 @@ def lit_view(frame: Frame, raster: Raster, traced: Traced, blend: str) -> Render
             shown = encoded(pixels.specular * light.weight * decoded(light.color, blend), blend)
             layers[light.name] = full_map(shown.detach(), chosen, shape)
             layers[light.color_name] = full_map(light.color.detach(), chosen, shape)
+            for name, part in light.parts.items():
+                shown = encoded(pixels.specular * light.weight * part, "linear")
+                layers[name] = full_map(shown.detach(), chosen, shape)
     return RenderedView(
         camera,
         full_view(flat.diffuse, chosen, change, shape),

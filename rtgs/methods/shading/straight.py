@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -21,6 +22,7 @@ class GlassPixels:
     inside: Tensor  # (H * W,) bool: the pixel shows the object and gets straight rays
     far: Tensor  # (H * W,) z-depth of the second surface, no graph; the first where there is none
     second: Tensor  # (H * W,) bool: a second surface was found
+    known: Tensor  # (H * W,) bool: the first surface is the mesh's, and glass
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,7 @@ class Transmission:
     color: Tensor  # (3, P) C_t of the traced pixels; 0 outside the object
     first_bounce: FirstBounce | None  # in training, for rays with a second surface
     observations: tuple[Observation, ...] = ()  # in training, of the transmittance set
+    parts: Mapping[str, Tensor] = field(default_factory=dict)  # (3, P) linear light each, when layers are asked for
 
 
 def glass_pixels(
@@ -83,7 +86,7 @@ def glass_pixels(
     near, second = flat.depth.detach(), surfaces.second.flatten() & met
     # A mesh away from the rasterised surface must not put the back before the front.
     far = torch.where(second, torch.maximum(surfaces.far.flatten(), near), near)
-    return GlassPixels(flat, inside, far, second)
+    return GlassPixels(flat, inside, far, second, known)
 
 
 def widened(inside: Tensor, pixels: int) -> Tensor:

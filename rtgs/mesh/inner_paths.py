@@ -1,0 +1,148 @@
+"""Where light is mirrored inside a transparent object, behind every pixel that sees its far wall.
+
+The straight ray through a pixel meets the far wall and is mirrored there, towards the inside; it crosses the object
+again and leaves through another wall, or is mirrored once more. Geometry alone: nothing here changes while the mesh
+stands, so the paths of a camera are found once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rtgs.core.cameras import Camera
+from rtgs.mesh.container import ObjectGuide, ObjectMesh, ObjectSurfaces, camera_key
+from rtgs.mesh.guide import RayHits
+from rtgs.mesh.normals import interpolated
+
+OFF_THE_WALL = 1e-4  # of the object's size: a mirrored ray starts so far inside
+CACHED = 512  # cameras whose paths are kept
+
+
+@dataclass(frozen=True)
+class Leg:
+    """L straight stretches of light inside the object, each after a reflection at a wall."""
+
+    parent: Tensor  # (L,) int64 row of the leg before; of the first leg: of the paths
+    origin: Tensor  # (L, 3) float32 world: where the light was mirrored
+    direction: Tensor  # (L, 3) float32 unit
+    length: Tensor  # (L,) float32 world units to the next wall; 0 where the mesh has none
+    cosine: Tensor  # (L,) float32 of the angle of incidence there; 1 where there is none
+
+    @property
+    def exit(self) -> Tensor:
+        """(L, 3) where the light leaves."""
+        return self.origin + self.length[:, None] * self.direction
+
+    def rows(self, chosen: Tensor, parent: Tensor) -> Leg:
+        """The stretches ``chosen`` (int64), with other parents."""
+        return Leg(parent, *(each[chosen] for each in (self.origin, self.direction, self.length, self.cosine)))
+
+
+@dataclass(frozen=True)
+class InnerPaths:
+    """The paths behind K pixels of one camera."""
+
+    pixels: Tensor  # (K,) int64 into the flattened image, ascending: their ray meets a far wall
+    cosine: Tensor  # (K,) float32 of the angle of incidence there
+    legs: tuple[Leg, ...]  # the first has K rows; later ones those that the one before goes on to
+
+    def take(self, wanted: Tensor) -> tuple[Tensor, InnerPaths]:
+        """Of pixels ``wanted`` (R,) int64: (K',) rows of it that have a path, and these paths in that order."""
+        place = torch.searchsorted(self.pixels, wanted).clamp_max(max(len(self.pixels) - 1, 0))
+        found = self.pixels[place] == wanted if len(self.pixels) else torch.zeros(len(wanted), dtype=torch.bool)
+        rows = found.nonzero()[:, 0]
+        chosen, count = place[rows], len(self.pixels)
+        legs, before = [], chosen
+        for leg in self.legs:
+            new = torch.full((count,), -1, dtype=torch.int64).index_copy(0, before, torch.arange(len(before)))
+            kept = chosen if not legs else (new[leg.parent] >= 0).nonzero()[:, 0]
+            legs.append(leg.rows(kept, torch.arange(len(kept)) if not legs else new[leg.parent[kept]]))
+            before, count = kept, len(leg.length)
+        return rows, InnerPaths(self.pixels[chosen], self.cosine[chosen], tuple(legs))
+
+
+class InnerGuide:
+    """The paths of each camera; the last ``CACHED`` cameras are remembered.
+
+    ``bounces``: reflections inside the object that are followed, at least 1. ``glass`` (F,) bool: faces that are glass;
+    light is mirrored at no others.
+    """
+
+    def __init__(self, mesh: ObjectMesh, glass: Tensor, bounces: int) -> None:
+        if bounces < 1:
+            raise ValueError(f"bounces is {bounces}: at least 1 reflection inside the object is followed")
+        self.mesh, self.bounces = mesh, bounces
+        self._glass = glass.numpy()
+        size = float(np.linalg.norm(mesh.bounds[1] - mesh.bounds[0]))
+        self._off, self._nearest = OFF_THE_WALL * size, 0.5 * mesh.voxel
+        self._cache: dict[tuple[object, ...], InnerPaths] = {}
+
+    def paths(self, camera: Camera, guide: ObjectGuide) -> InnerPaths:
+        """Behind the pixels of ``camera`` whose far wall is glass; ``guide`` of the same mesh."""
+        key = camera_key(camera)
+        found = self._cache.pop(key, None)
+        found = self._find(camera, guide.surfaces(camera)) if found is None else found
+        self._cache[key] = found
+        while len(self._cache) > CACHED:
+            del self._cache[next(iter(self._cache))]
+        return found
+
+    def _find(self, camera: Camera, surfaces: ObjectSurfaces) -> InnerPaths:
+        pixels = surfaces.second.flatten().nonzero()[:, 0]
+        rays = camera.rays(torch.float64)
+        directions = rays.directions.reshape(-1, 3)[pixels].numpy()
+        origins = np.broadcast_to(rays.origin.numpy(), directions.shape).copy()
+        hits = self.mesh.rays.intersect(origins, directions)
+        far = surfaces.far.flatten()[pixels].double().numpy()
+        nearest = np.abs(np.where(np.isfinite(hits.distance), hits.distance, np.inf) - far[:, None]).argmin(1)
+        rows = np.arange(len(pixels))
+        triangle, distance = hits.triangle[rows, nearest], hits.distance[rows, nearest]
+        kept = np.isfinite(distance)
+        kept[kept] &= self._glass[triangle[kept]]
+        points = origins[kept] + distance[kept, None] * directions[kept]
+        unit = directions[kept] / np.linalg.norm(directions[kept], axis=1, keepdims=True)
+        normal = self._inward(triangle[kept], points, unit)
+        legs: list[Leg] = []
+        parent, cosine = np.arange(int(kept.sum())), -(normal * unit).sum(1)
+        for _ in range(self.bounces):
+            leg, points, unit, normal, going = self._mirror(parent, points, unit, normal)
+            legs.append(leg)
+            parent, points, unit, normal = going, points[going], unit[going], normal[going]
+        return InnerPaths(pixels[torch.from_numpy(kept)], _float(cosine), tuple(legs))
+
+    def _mirror(self, parent: np.ndarray, points: np.ndarray, unit: np.ndarray, normal: np.ndarray):
+        """The leg from ``points``; with where it ends, its directions, normals there, and the rows that go on."""
+        mirrored = unit - 2 * (unit * normal).sum(1, keepdims=True) * normal
+        hits = self.mesh.rays.intersect(points + self._off * normal, mirrored)
+        triangle, length, there = self._first(hits)
+        ends = points + length[:, None] * mirrored
+        inward = np.zeros_like(points)
+        inward[there] = self._inward(triangle[there], ends[there], mirrored[there])
+        cosine = np.where(there, -(inward * mirrored).sum(1), 1.0)
+        leg = Leg(torch.from_numpy(parent), _float(points), _float(mirrored), _float(length), _float(cosine))
+        goes_on = there.copy()
+        goes_on[there] &= self._glass[triangle[there]]
+        return leg, ends, mirrored, inward, np.flatnonzero(goes_on)
+
+    def _first(self, hits: RayHits) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Triangle, distance (0: none) and whether there is one, of the first crossing that is not the wall left."""
+        rows = np.arange(len(hits.distance))
+        distance = np.where(hits.distance > self._nearest, hits.distance, np.inf)
+        first = distance.argmin(1)
+        length, triangle = distance[rows, first], hits.triangle[rows, first]
+        there = np.isfinite(length) & (triangle >= 0)
+        return triangle, np.where(there, length, 0.0), there
+
+    def _inward(self, triangle: np.ndarray, points: np.ndarray, unit: np.ndarray) -> np.ndarray:
+        """(P, 3) unit smoothed normals, against the direction in which the light comes."""
+        normal = interpolated(self.mesh.mesh, self.mesh.corners, triangle, points).astype(np.float64)
+        along = (normal * unit).sum(1, keepdims=True)
+        return np.where(along > 0, -normal, normal)
+
+
+def _float(values: np.ndarray) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(values, np.float32))

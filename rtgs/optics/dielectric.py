@@ -1,0 +1,54 @@
+"""How much light a wall of clear glass reflects: exact Fresnel reflectance of one surface, and of a thin wall.
+
+A wall has two surfaces so near to each other that a ray leaves it where it came in. Summing the reflections between
+them gives R = F + (1 - F)^2 F / (1 - F^2) = 2 F / (1 + F), and the rest, T = 1 - R, passes: clear glass absorbs
+nothing (Mitsuba's ``thindielectric``; Stam 2001 for the series). What it leaves out: absorption, the shift of the ray
+inside the wall, polarisation from one wall to the next.
+
+Plain torch, any dtype and shape, differentiable in both arguments.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+SMALLEST_COSINE = 1e-4  # at grazing incidence all light is reflected; the slope in the cosine stays finite
+
+
+def fresnel_dielectric(cosine: Tensor, index: Tensor | float) -> Tensor:
+    """Unpolarised reflectance of a smooth surface between air and glass.
+
+    Parameters
+    ----------
+    cosine : Tensor
+        Of the angle of incidence, in air; clamped to 1e-4..1.
+    index : Tensor or float
+        Index of refraction of the glass over that of air, at least 1 (gradients: at least 1.05); broadcast.
+
+    Returns
+    -------
+    Tensor
+        In 0..1: ((n - 1) / (n + 1))^2 at normal incidence, 1 at grazing incidence.
+
+    References
+    ----------
+    Pharr, Jakob, Humphreys, Physically Based Rendering, 4th edition, 9.3.5.
+    """
+    cosine = cosine.clamp(SMALLEST_COSINE, 1)
+    inside = torch.sqrt(1 - (1 - cosine * cosine) / (index * index))
+    across = (cosine - index * inside) / (cosine + index * inside)
+    along = (index * cosine - inside) / (index * cosine + inside)
+    return 0.5 * (across * across + along * along)
+
+
+def wall_reflectance(cosine: Tensor, index: Tensor | float) -> Tensor:
+    """R = 2 F / (1 + F): what a thin wall of clear glass reflects; it lets 1 - R pass.
+
+    Parameters
+    ----------
+    cosine, index : Tensor, Tensor or float
+        As of :func:`fresnel_dielectric`.
+    """
+    surface = fresnel_dielectric(cosine, index)
+    return 2 * surface / (1 + surface)

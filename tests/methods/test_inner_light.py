@@ -1,0 +1,171 @@
+"""Light mirrored inside glass: a white furnace, contents in the way, gradients, and the whole model's layers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+from glass_cases import GlassScene, begun, glass_recipe, glass_scene, train_stages
+from torch import Tensor
+
+from rtgs.core.errors import RtgsError
+from rtgs.mesh.inner_paths import InnerPaths, Leg
+from rtgs.methods import Mode, RenderOptions
+from rtgs.methods.model import Model
+from rtgs.methods.settings import MethodSettings
+from rtgs.methods.shading.inner import TracedLeg, far_wall, inner_light
+from rtgs.optics.dielectric import wall_reflectance
+from rtgs.optics.light import decoded, encoded
+from rtgs.optics.settings import WallSettings
+from rtgs.train.terms import as_the_sensor
+
+STEP = 40
+
+
+def chain(count: int, bounces: int, cosine: float = 0.7) -> InnerPaths:
+    """Paths in a ball: the same angle at every wall."""
+    rows, ones = torch.arange(count), torch.ones(count, dtype=torch.float64)
+    leg = Leg(rows, torch.zeros(count, 3), torch.zeros(count, 3), ones, cosine * ones)
+    return InnerPaths(rows, cosine * ones, (leg,) * bounces)
+
+
+def met(count: int, contents: float = 0.0, alpha: float = 0.0, surroundings: float = 1.0) -> TracedLeg:
+    def full(value: float, *shape: int) -> Tensor:
+        return torch.full(shape, value, dtype=torch.float64)
+
+    return TracedLeg(full(contents, count, 3), full(alpha, count), full(surroundings, count, 3))
+
+
+@pytest.mark.parametrize("bounces", [1, 2, 5])
+def test_in_a_white_furnace_only_the_last_reflection_is_missing(bounces: int):
+    paths = chain(4, bounces)
+    reflected = float(wall_reflectance(torch.tensor(0.7, dtype=torch.float64), 1.5))
+    arriving = inner_light(paths, [met(4)] * bounces, 1.5)
+    torch.testing.assert_close(arriving, torch.full_like(arriving, 1 - reflected**bounces))
+    sent = far_wall(torch.ones(6, 3, dtype=torch.float64), arriving, torch.tensor([0, 2, 3, 5]), paths.cosine, 1.5)
+    expected = torch.full_like(sent, 1 - reflected ** (bounces + 1))
+    expected[[1, 4]] = 1.0  # nothing is mirrored there
+    torch.testing.assert_close(sent, expected)
+
+
+def test_contents_hide_what_lies_behind_them_on_the_way_of_the_light():
+    paths = chain(3, 1)
+    opaque = inner_light(paths, [met(3, contents=0.4, alpha=1.0)], 1.5)
+    torch.testing.assert_close(opaque, decoded(torch.full_like(opaque, 0.4), "linear"))
+    half = inner_light(paths, [met(3, contents=0.2, alpha=0.5, surroundings=0.8)], 1.5)
+    wall = 1 - wall_reflectance(paths.cosine, 1.5)[:, None]
+    behind = encoded(wall * decoded(torch.tensor(0.8, dtype=torch.float64), "linear"), "linear")
+    torch.testing.assert_close(half, decoded(0.2 + 0.5 * behind, "linear").expand_as(half))
+
+
+def test_a_path_that_ends_early_gives_the_earlier_legs_their_share():
+    whole, short = chain(4, 2), chain(4, 2)
+    some = torch.tensor([1, 3])
+    second = whole.legs[1].rows(some, some)
+    short = replace(short, legs=(whole.legs[0], second))
+    both = inner_light(whole, [met(4), met(4)], 1.5)
+    partly = inner_light(short, [met(4), met(2)], 1.5)
+    once = inner_light(chain(4, 1), [met(4)], 1.5)
+    torch.testing.assert_close(partly[some], both[some])
+    torch.testing.assert_close(partly[[0, 2]], once[[0, 2]])
+
+
+def test_every_gradient_is_right():
+    generator = torch.Generator().manual_seed(0)
+    paths = chain(3, 2, 0.4)
+    drawn = [torch.rand(3, 3, generator=generator, dtype=torch.float64).add(0.1).requires_grad_() for _ in range(5)]
+    alphas = [torch.rand(3, generator=generator, dtype=torch.float64).mul(0.8).requires_grad_() for _ in range(2)]
+    index = torch.tensor([1.45], dtype=torch.float64, requires_grad=True)
+
+    def light(index: Tensor, *given: Tensor) -> Tensor:
+        traced = [TracedLeg(given[0], given[5], given[1]), TracedLeg(given[2], given[6], given[3])]
+        return far_wall(given[4], inner_light(paths, traced, index), paths.pixels, paths.cosine, index)
+
+    assert torch.autograd.gradcheck(light, (index, *drawn, *alphas))
+
+
+@pytest.fixture(scope="module")
+def made() -> GlassScene:
+    return glass_scene()
+
+
+def fresnel(**changes: object) -> MethodSettings:
+    base = glass_recipe(normal="mesh")
+    return replace(
+        base,
+        optics=replace(base.optics, blend="linear"),
+        loss=replace(base.loss, clipped=True),
+        transmittance=replace(base.transmittance, wall=WallSettings(light="fresnel", **changes)),  # type: ignore[arg-type]
+    )
+
+
+def shown(method: Model, made: GlassScene):
+    view = made.scene.train[0]
+    with torch.no_grad():
+        return method.render(view.camera, STEP, Mode.EVALUATE, RenderOptions(layers=True), view.mask)
+
+
+def test_the_layers_add_up_in_linear_light(made: GlassScene):
+    found = shown(begun(fresnel(bounces=2), made), made)
+    assert found.layers is not None
+    light = {name: decoded(found.layers[name], "linear") for name in ("inner", "contents", "behind", "transmission")}
+    total = light["inner"] + light["contents"] + light["behind"]
+    torch.testing.assert_close(total, light["transmission"], atol=1e-4, rtol=1e-3)
+    inside = found.maps["transparent"]
+    assert float(light["inner"][:, inside].mean()) > 1e-3
+    assert float(light["inner"][:, ~inside].abs().max()) == 0
+    reflected = decoded(found.layers["reflection"], "linear")
+    bare = (1 - found.layers["specular"] * found.layers["traced"]) * decoded(found.layers["diffuse"], "linear")
+    image = encoded(bare + reflected + light["transmission"], "linear")
+    torch.testing.assert_close(found.image, image, atol=1e-4, rtol=1e-3)
+
+
+def test_without_inner_bounces_no_light_is_mirrored_inside(made: GlassScene):
+    found = shown(begun(fresnel(bounces=0), made), made)
+    assert found.layers is not None
+    assert "inner" not in found.layers
+    assert "transmission" in found.layers
+
+
+def test_the_index_is_learned_where_it_may_and_goes_on_bit_for_bit(made: GlassScene):
+    method = begun(fresnel(index_rate=0.01), made)
+    (group,) = method.groups
+    assert group.name == "glass"
+    whole = begun(fresnel(index_rate=0.01), made)
+    train_stages(whole, made.scene)
+    (learned,) = whole.groups
+    assert float(learned["index"]) != 1.5  # type: ignore[index]
+    assert 1.05 <= float(learned["index"]) <= 2.5  # type: ignore[index]
+    method.load(whole.state())
+    again = shown(method, made).image
+    assert torch.equal(again, shown(whole, made).image)
+    assert begun(fresnel(), made).groups == ()
+
+
+@pytest.mark.parametrize(
+    ("made", "message"),
+    [
+        (
+            lambda: glass_recipe(wall=WallSettings(light="fresnel")),
+            r"wall\.light=fresnel gives shares of linear light, but method\.optics\.blend=srgb",
+        ),
+        (
+            lambda: replace(fresnel().transmittance, first_bounce="base"),
+            r"wall\.bounces=1 follows light through the transmittance set",
+        ),
+        (lambda: fresnel(index=0.9), r"method\.transmittance\.wall\.index=0\.9 must be between 1\.05 and 2\.5"),
+        (lambda: fresnel(bounces=-1), r"method\.transmittance\.wall\.bounces=-1 must be at least 0"),
+        (lambda: fresnel(cover=0.0), r"method\.transmittance\.wall\.cover=0\.0 must be above 0"),
+    ],
+)
+def test_settings_that_do_not_fit_are_refused(made: Callable[[], object], message: str):
+    with pytest.raises(RtgsError, match=message):
+        made()
+
+
+def test_a_sensor_stops_at_its_brightest_value_and_nowhere_else():
+    photo = torch.tensor([[[1.0, 1.0, 0.9, 0.2]]]).expand(3, 1, 4)
+    image = torch.tensor([[[1.7, 0.8, 1.7, 0.2]]]).expand(3, 1, 4)
+    torch.testing.assert_close(as_the_sensor(image, photo)[0, 0], torch.tensor([1.0, 0.8, 1.7, 0.2]))
