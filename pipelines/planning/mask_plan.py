@@ -30,7 +30,7 @@ def plan_masks(config: RunConfig, inspection: Inspection) -> MaskPlan:
         MissingWeights: ``masks=grounded_sam2`` and a network is not there.
         PrepareError: a file named is not there, or given masks in a form that photos without poses cannot have.
     """
-    from rtgs.prepare.masks.makers import find_networks
+    from rtgs.prepare.masks.networks import find_networks
 
     settings = config.masks
     if settings.source == "none":
@@ -45,7 +45,7 @@ def plan_masks(config: RunConfig, inspection: Inspection) -> MaskPlan:
 
 def _automatic(config: RunConfig, inspection: Inspection) -> MaskPlan:
     from rtgs.prepare.masks.drawn import drawn_kinds
-    from rtgs.prepare.masks.makers import find_networks
+    from rtgs.prepare.masks.networks import find_networks
     from rtgs.prepare.pretrained import MissingWeights
 
     if given := inspection.given_masks or _no_glass(inspection.source):
@@ -111,7 +111,7 @@ def mask_step(
     """
     from importlib.metadata import version
 
-    from rtgs.prepare.masks.makers import find_networks
+    from rtgs.prepare.masks.networks import find_networks
 
     settings = config.masks
     given = replace(settings.given, folder=settings.given.folder or config.scene.masks_dir or "masks")

@@ -14,7 +14,7 @@ pytest.importorskip("onnxruntime")
 pytest.importorskip("tokenizers")
 
 from rtgs.prepare.masks import make as masks
-from rtgs.prepare.masks import makers as masks_makers
+from rtgs.prepare.masks import maker, makers, networks
 from rtgs.prepare.masks.make import MaskRequest, make_masks
 from rtgs.prepare.masks.settings import DetectorSettings, GivenSettings, MaskSettings
 from rtgs.prepare.normals import make as normals
@@ -57,7 +57,7 @@ def counter(monkeypatch) -> Counter:
     """Every function by which the preparation reads photos, masks and normal maps."""
     count = Counter()
     readers = ("read_photo", "read_mask", "read_normals", "fitted_mask", "read_given")
-    for module in (masks, masks_makers, normals, photos, export):
+    for module in (masks, maker, makers, networks, normals, photos, export):
         for name in readers:
             if hasattr(module, name):
                 monkeypatch.setattr(module, name, count.wrapped(getattr(module, name)))

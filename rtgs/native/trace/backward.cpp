@@ -1,7 +1,7 @@
 // Gradients of a packet from its tape (docs/tracer.md): responses surfel by surfel, the recursion along the rays row by
 // row, then all sums surfel by surfel, with rays as lanes and one transposed reduction per (surfel, packet). Surfels come
 // by ascending id, so that the sums of a ray do not depend on the tree.
-#include "trace/rows.h"
+#include "trace/ray_rows.h"
 
 namespace rtgs::RTGS_ISA {
 namespace {
@@ -9,8 +9,8 @@ namespace {
 class PacketBackward {
  public:
   PacketBackward(const TraceBackwardArgs& args, TraceWorkspace& work, const ColorMasks& masks, int64_t packet, int part)
-      : args_(args), work_(work), masks_(masks), tape_(args.tapes[packet]), layout_(args.surfels), part_(part),
-        rays_(args.rays, packet) {
+      : args_(args), work_(work), tape_(args.tapes[packet]), part_(part), rays_(args.rays, packet),
+        ray_rows_(args.surfels, masks) {
     for (int k = 0; k < 3; ++k) to_origin_[k] = to_direction_[k] = broadcast(0.f);
   }
 
@@ -37,22 +37,13 @@ class PacketBackward {
   void add_surfels();
   void geometry_sums(const float* s, const PlaneHit& hit, int32_t place, vmask met, vfloat w, vfloat* sums);
   float* destination(int32_t slot, bool& adds);
-  template <bool kClamped>
-  vfloat sum_column(const SurfelHits& hits, const float* column, const uint32_t (*masks)[kMostColumns]) const;
-  void sum_hits(const SurfelHits& hits, float* out, bool adds) const;
-  void add_direction(const SurfelHits& hits, uint32_t lanes, int64_t id);
-  bool sum_both(const SurfelHits& hits, int64_t id, float* out, bool adds);
-  template <int K, bool kClamped>
-  void sum_both_of(const SurfelHits& hits, int64_t id, float* out, bool adds);
   void write_rays();
 
   const float* record(int32_t slot) const { return args_.records + int64_t(kTraceFields) * slot; }
 
   const TraceBackwardArgs& args_;
   TraceWorkspace& work_;
-  const ColorMasks& masks_;
   const PacketTape& tape_;
-  const RowLayout layout_;
   const int part_;
   const PacketRays rays_;
 
@@ -62,8 +53,7 @@ class PacketBackward {
   vfloat basis_[16];
   vint last_place_ = broadcast_int(-1);
   vfloat to_origin_[3], to_direction_[3];
-  RayRow ray_rows_[kLanes];
-  alignas(64) float to_basis_[kLanes][kMostColumns];  // of the ray: gradient to its basis, at 3 k + c
+  RayRows ray_rows_;
 };
 
 // ---- upstream --------------------------------------------------------------------------------------------------
@@ -81,7 +71,7 @@ inline void PacketBackward::add_rest(vfloat to_output, const float* output, int 
 
 void PacketBackward::load_upstream() {
   const int features = args_.surfels.feature_count();
-  for (int lane = 0; lane < kLanes; ++lane) memset(ray_rows_[lane].channels, 0, layout_.channels * sizeof(float));
+  ray_rows_.clear_channels();
   for (int c = 0; c < features; ++c) {
     to_features_[c] = upstream(args_.grad_features, features, c);
     add_rest(to_features_[c], args_.features, features, c);
@@ -104,10 +94,8 @@ void PacketBackward::load_harmonics() {
   packet_basis(args_.surfels.degree, rays_.color_direction(args_.options.raw_sh), basis_);
   const int rest = rest_count(args_.surfels.degree);
   for (int lane = 0; lane < kLanes; ++lane) {
+    ray_rows_.clear_coefficients(lane);
     RayRow& row = ray_rows_[lane];
-    memset(row.coefficients, 0, layout_.coefficients * sizeof(float));
-    memset(row.pattern, 0, layout_.coefficients * sizeof(float));
-    memset(to_basis_[lane], 0, layout_.coefficients * sizeof(float));
     for (int k = 0; k < rest; ++k)
       for (int c = 0; c < 3; ++c) {
         row.pattern[3 * k + c] = to_colors_[c][lane];
@@ -235,107 +223,11 @@ inline float* PacketBackward::destination(int32_t slot, bool& adds) {
   return args_.rows + int64_t(slot) * args_.row_stride;
 }
 
-inline void put(float* out, vfloat v, bool adds) { store(out, adds ? load(out) + v : v); }
-
-// Sum of weight times one register of the ray rows; column: that register of the first ray's row.
-template <bool kClamped>
-inline vfloat PacketBackward::sum_column(const SurfelHits& hits, const float* column,
-                                         const uint32_t (*masks)[kMostColumns]) const {
-  constexpr int kRowFloats = sizeof(RayRow) / sizeof(float);
-  vfloat sum = broadcast(0.f);
-  for (uint32_t left = hits.lanes; left; left &= left - 1) {
-    const int lane = __builtin_ctz(left);
-    vfloat values = load(column + lane * kRowFloats);
-    if (kClamped) values = (vfloat)((vint)values & load_int((const int32_t*)masks[hits.clamped_colors[lane]]));
-    sum = fma(broadcast(hits.weights[lane]), values, sum);
-  }
-  return sum;
-}
-
-inline void PacketBackward::sum_hits(const SurfelHits& hits, float* out, bool adds) const {
-  const RayRow& first = ray_rows_[0];
-  for (int c = 0; c < layout_.channels; c += kLanes) {
-    const auto masks = (const uint32_t(*)[kMostColumns])(masks_.channels[0] + c);
-    const vfloat sum = hits.clamped ? sum_column<true>(hits, first.channels + c, masks)
-                                    : sum_column<false>(hits, first.channels + c, masks);
-    put(out + kTraceGradChannels + c, sum, adds);
-  }
-  for (int c = 0; c < layout_.coefficients; c += kLanes) {
-    const auto masks = (const uint32_t(*)[kMostColumns])(masks_.coefficients[0] + c);
-    const vfloat sum = hits.clamped ? sum_column<true>(hits, first.coefficients + c, masks)
-                                    : sum_column<false>(hits, first.coefficients + c, masks);
-    put(out + kTraceGradChannels + layout_.channels + c, sum, adds);
-  }
-}
-
-inline void PacketBackward::add_direction(const SurfelHits& hits, uint32_t lanes, int64_t id) {
-  const float* values = args_.surfels.sh_rest + int64_t(3) * args_.surfels.rest * id;
-  const int used = 3 * rest_count(args_.surfels.degree);
-  for (int c = 0; c < layout_.coefficients; c += kLanes) {
-    const vfloat value = load_first(values + c, used - c < kLanes ? used - c : kLanes);
-    for (uint32_t left = lanes; left; left &= left - 1) {
-      const int lane = __builtin_ctz(left);
-      vfloat pattern = load(ray_rows_[lane].pattern + c);
-      if (hits.clamped) {
-        const uint32_t* mask = masks_.coefficients[hits.clamped_colors[lane]] + c;
-        pattern = (vfloat)((vint)pattern & load_int((const int32_t*)mask));
-      }
-      float* sum = to_basis_[lane] + c;
-      store(sum, fma(hits.weights[lane] * pattern, value, load(sum)));
-    }
-  }
-}
-
-// sum_hits and add_direction in one pass over the hits, for colours alone and K registers of coefficients.
-template <int K, bool kClamped>
-inline void PacketBackward::sum_both_of(const SurfelHits& hits, int64_t id, float* out, bool adds) {
-  const float* values = args_.surfels.sh_rest + int64_t(3) * args_.surfels.rest * id;
-  const int used = 3 * rest_count(args_.surfels.degree);
-  vfloat value[K], sums[K], channels = broadcast(0.f);
-  for (int k = 0; k < K; ++k) {
-    value[k] = load_first(values + k * kLanes, used - k * kLanes < kLanes ? used - k * kLanes : kLanes);
-    sums[k] = broadcast(0.f);
-  }
-  for (uint32_t left = hits.lanes; left; left &= left - 1) {
-    const int lane = __builtin_ctz(left);
-    const RayRow& row = ray_rows_[lane];
-    const vfloat w = broadcast(hits.weights[lane]);
-    const auto kept = [&](const float* from, const uint32_t* mask) {
-      const vfloat v = load(from);
-      return kClamped ? (vfloat)((vint)v & load_int((const int32_t*)mask)) : v;
-    };
-    const int clamped = kClamped ? hits.clamped_colors[lane] : 0;
-    channels = fma(w, kept(row.channels, masks_.channels[clamped]), channels);
-#pragma GCC unroll 6
-    for (int k = 0; k < K; ++k) {
-      const uint32_t* mask = masks_.coefficients[clamped] + k * kLanes;
-      float* to = to_basis_[lane] + k * kLanes;
-      sums[k] = fma(w, kept(row.coefficients + k * kLanes, mask), sums[k]);
-      store(to, fma(w * kept(row.pattern + k * kLanes, mask), value[k], load(to)));
-    }
-  }
-  put(out + kTraceGradChannels, channels, adds);
-  for (int k = 0; k < K; ++k) put(out + kTraceGradChannels + (k + 1) * kLanes, sums[k], adds);
-}
-inline bool PacketBackward::sum_both(const SurfelHits& hits, int64_t id, float* out, bool adds) {
-  if (layout_.channels != kLanes) return false;
-  switch (layout_.coefficients / kLanes) {
-#define RTGS_SUM_BOTH(K)                                        \
-  case K:                                                       \
-    if (hits.clamped) sum_both_of<K, true>(hits, id, out, adds); \
-    else sum_both_of<K, false>(hits, id, out, adds);            \
-    return true;
-    RTGS_SUM_BOTH(1) RTGS_SUM_BOTH(2) RTGS_SUM_BOTH(3) RTGS_SUM_BOTH(6)
-#undef RTGS_SUM_BOTH
-    default: return false;
-  }
-}
-
 void PacketBackward::add_surfels() {
   for (int k = 0; k < tape_.surfels; ++k) {
     if (args_.surfel_gradients && k + kTracePrefetch < tape_.surfels) {
       const float* row = args_.rows + int64_t(tape_.slots[k + kTracePrefetch]) * args_.row_stride;
-      for (int c = 0; c < layout_.floats; c += 16) __builtin_prefetch(row + c, 1);
+      for (int c = 0; c < ray_rows_.layout().floats; c += 16) __builtin_prefetch(row + c, 1);
     }
     const int32_t slot = tape_.slots[k], place = tape_.places[k];
     const float* s = record(slot);
@@ -350,12 +242,12 @@ void PacketBackward::add_surfels() {
       bool adds;
       float* out = destination(slot, adds);
       for (int c = 0; c < kTraceGradChannels; c += kLanes) put(out + c, settled(sums_of<>(sums + c)), adds);
-      if (args_.ray_gradients && !args_.options.last_sh && sum_both(hits, tape_.ids[k], out, adds)) continue;
-      sum_hits(hits, out, adds);
+      if (args_.ray_gradients && !args_.options.last_sh && ray_rows_.sum_both(hits, tape_.ids[k], out, adds)) continue;
+      ray_rows_.sum_hits(hits, out, adds);
     }
-    if (args_.ray_gradients && layout_.coefficients) {
+    if (args_.ray_gradients && ray_rows_.layout().coefficients) {
       const uint32_t last = mask_bits(eq_int(last_place_, broadcast_int(place)));
-      add_direction(hits, args_.options.last_sh ? hits.lanes & last : hits.lanes, tape_.ids[k]);
+      ray_rows_.add_direction(hits, args_.options.last_sh ? hits.lanes & last : hits.lanes, tape_.ids[k]);
     }
   }
 }
@@ -363,13 +255,13 @@ void PacketBackward::add_surfels() {
 void PacketBackward::write_rays() {
   if (args_.options.last_sh)
     for (vfloat& v : to_direction_) v = broadcast(0.f);
-  if (layout_.coefficients) {
+  if (ray_rows_.layout().coefficients) {
     const Direction d = rays_.color_direction(args_.options.raw_sh);
     vfloat to_basis[kMostColumns];
     for (vfloat& v : to_basis) v = broadcast(0.f);
     for (int k = 0; k < rest_count(args_.surfels.degree); ++k)
       for (int lane = 0; lane < kLanes; ++lane) {
-        const float* sums = to_basis_[lane] + 3 * k;
+        const float* sums = ray_rows_.to_basis(lane) + 3 * k;
         to_basis[3 * k][lane] = sums[0] + sums[1] + sums[2];
       }
     Direction g = args_.surfels.degree == 1   ? sh_derivative<1>(d, to_basis)

@@ -1,4 +1,4 @@
-// Gradient rows of the tracer's backward pass: their layout, what a ray puts into them, how threads share them.
+// Gradient rows of the tracer's backward pass: their layout, and how threads share them.
 #pragma once
 #include "trace/packet.h"
 
@@ -14,47 +14,6 @@ struct RowLayout {
         coefficients(s.sh_dc ? padded(3 * rest_count(s.degree)) : 0),
         floats(kTraceGradChannels + channels + coefficients) {}
 };
-
-// Upstream gradients of one ray, as the rows of the surfels it hit want them. Every hit adds weight times this.
-struct alignas(64) RayRow {
-  float channels[kMostColumns];      // features, colours
-  float coefficients[kMostColumns];  // colour c times basis k, at 3 k + c
-  float pattern[kMostColumns];       // colour c at 3 k + c
-};
-
-// Bits of a ray row that stay where some colours of a surfel are clamped at zero; by those colours, a bit each.
-struct alignas(64) ColorMasks {
-  uint32_t channels[8][kMostColumns], coefficients[8][kMostColumns];
-  explicit ColorMasks(int features) {
-    for (int clamped = 0; clamped < 8; ++clamped) {
-      for (int c = 0; c < kMostColumns; ++c)
-        channels[clamped][c] = c >= features && c < features + 3 && clamped >> (c - features) & 1 ? 0 : ~0u;
-      for (int c = 0; c < kMostColumns; ++c) coefficients[clamped][c] = clamped >> (c % 3) & 1 ? 0 : ~0u;
-    }
-  }
-};
-
-struct SurfelHits {  // of one packet on one surfel
-  uint32_t lanes;
-  bool clamped;                    // any colour of any hit
-  alignas(64) float weights[kLanes];
-  uint8_t clamped_colors[kLanes];  // where clamped
-};
-
-static inline SurfelHits surfel_hits(vmask met, vfloat w, uint64_t clamped) {
-  SurfelHits hits;
-  hits.lanes = mask_bits(met);
-  store(hits.weights, w);
-  clamped &= hits.lanes * 0x000100010001ull;  // what the other rays would see does not matter
-  hits.clamped = clamped != 0;
-  if (hits.clamped)
-    for (uint32_t left = hits.lanes; left; left &= left - 1) {
-      const int lane = __builtin_ctz(left);
-      const uint64_t bits = clamped >> lane;
-      hits.clamped_colors[lane] = uint8_t((bits & 1) | (bits >> 15 & 2) | (bits >> 30 & 4));
-    }
-  return hits;
-}
 
 // ---- threads -----------------------------------------------------------------------------------------------------
 // Ranges of about equal work: range_starts. And to which range each surfel's row belongs.

@@ -11,7 +11,8 @@ from PIL import Image
 
 from rtgs.prepare.errors import PrepareError
 from rtgs.prepare.masks.hull import Consensus, Hull, SmallMask, find_consensus, limits, small_mask
-from rtgs.prepare.masks.makers import Made, Maker, make_maker
+from rtgs.prepare.masks.maker import Made, Maker
+from rtgs.prepare.masks.makers import make_maker
 from rtgs.prepare.masks.report import METHODS, PICTURE_FILE, MaskReport, MaskRow, Tile, draw_masks
 from rtgs.prepare.masks.settings import CleanSettings, MaskSettings
 from rtgs.prepare.progress import Say, Ticker

@@ -19,7 +19,7 @@ pytest.importorskip("tokenizers")
 from pipelines.cli.main import main
 from rtgs.prepare.errors import PrepareError
 from rtgs.prepare.masks.make import MaskRequest, make_masks
-from rtgs.prepare.masks.makers import file_digest, find_networks
+from rtgs.prepare.masks.networks import file_digest, find_networks
 from rtgs.prepare.masks.report import MaskReport
 from rtgs.prepare.masks.settings import (
     CleanSettings,

@@ -10,7 +10,7 @@ pytest.importorskip("onnxruntime")
 from pipelines.cli.main import main
 from rtgs.core.errors import RtgsError
 from rtgs.prepare.errors import PrepareError
-from rtgs.prepare.masks.makers import file_digest
+from rtgs.prepare.masks.networks import file_digest
 from rtgs.prepare.normals.adapters import ADAPTERS, NormalAdapter
 from rtgs.prepare.normals.make import find_network
 from rtgs.prepare.pretrained import REGISTRY, MissingWeights, WrongWeights
