@@ -11,6 +11,7 @@ from torch import Tensor
 from rtgs.core.cameras import Camera
 from rtgs.gaussians.materials import activate_materials
 from rtgs.gaussians.surfels import ActivatedGaussians, Surfels, activate
+from rtgs.mesh.inner_paths import InnerPaths, Leg
 from rtgs.methods.model import Model
 from rtgs.methods.parts.kinds import surfel_options
 from rtgs.methods.shading.mirror import SHORTEST_NORMAL, SurfacePixels, mirror_rays, pixel_weights, surface_pixels
@@ -45,6 +46,16 @@ def to_srgb(light: Tensor) -> Tensor:
     return torch.where(light > 0.0031308, 1.055 * light.clamp_min(0.003) ** (1 / 2.4) - 0.055, 12.92 * light)
 
 
+def thin_wall(cosine: Tensor, index: float) -> Tensor:
+    """2 F / (1 + F), F of the angles of incidence and refraction (Fresnel's sine and tangent laws)."""
+    outside = cosine.double().clamp(1e-4, 1 - 1e-9).acos()  # the laws have no limit at 0
+    inside = (outside.sin() / index).asin()
+    across = ((outside - inside).sin() / (outside + inside).sin()) ** 2
+    along = ((outside - inside).tan() / (outside + inside).tan()) ** 2
+    surface = (across + along) / 2
+    return 2 * surface / (1 + surface)
+
+
 class GlassTwin:
     """Reads a method's settings and plan, and none of its renderers."""
 
@@ -62,6 +73,11 @@ class GlassTwin:
         known = met & self.method.parts["glass"]._glass[surfaces.triangle.flatten().clamp_min(0).long()]
         if self.settings.first_surface == "mesh":
             flat = replace(flat, depth=torch.where(known, surfaces.near.flatten().double(), flat.depth))
+        if self.settings.normal == "mesh":
+            flat = replace(flat, normal=torch.where(known, surfaces.normal.flatten(1).double(), flat.normal))
+        if self.thin:
+            grown = (flat.specular / self.settings.wall.cover).clamp(max=1)
+            flat = replace(flat, specular=torch.where(known, grown, flat.specular))
         covered &= flat.depth > 0
         rays = self.camera.rays(torch.float64)
         view = rays.directions.reshape(-1, 3).T
@@ -80,6 +96,10 @@ class GlassTwin:
             near_bound = (own - self.settings.max_weight).abs() < 1e-4
             self.fragile |= inside & (near_bound if near_bound.ndim == 1 else near_bound.any(0))
             own = own.clamp_max(self.settings.max_weight)
+        passing = weights.transmission
+        if self.thin:
+            own = thin_wall(mirrored.cosine, self.settings.wall.index)
+            passing = 1 - own
         reflection = torch.where(inside, own, weights.reflection)
         linear = self.method.settings.optics.blend == "linear"
         light = reflection * (to_linear(reflected.colors.T) if linear else reflected.colors.T)
@@ -89,13 +109,65 @@ class GlassTwin:
         far = torch.where(second, torch.maximum(surfaces.far.flatten().double()[rows], near), near)
         color, first = self._through(rays.origin, view[:, rows].T, near, far, second, rows)
         color = to_linear(color) if linear else color
-        light = light + weights.transmission * torch.zeros_like(light).index_copy(1, rows, color.T)
+        light = light + passing * torch.zeros_like(light).index_copy(1, rows, color.T)
         shape = (self.camera.height, self.camera.width)
         base = to_linear(flat.diffuse) if linear else flat.diffuse
         mixed = (1 - flat.specular) * base + flat.specular * light
         image = torch.where(covered, to_srgb(mixed) if linear else mixed, flat.diffuse).reshape(3, *shape)
         depth = first.depth if first.depth is not None else near
         return TwinGlass(image, depth[second], self.fragile.reshape(shape))
+
+    @property
+    def thin(self) -> bool:
+        return self.settings.wall.light == "fresnel"
+
+    def _mirrored_inside(self, behind: Tensor, rows: Tensor) -> Tensor:
+        """(R, 3) light that the far wall sends on: one path at a time, from its last wall back."""
+        method, settings = self.method, self.settings
+        guide = method.parts["glass"].guide
+        every = method.parts["glass"].wall._inner.paths(self.camera, guide)
+        options = replace(method.parts["mirror"].trace_options(self.step, False), weight_sum=False)
+        start = settings.offset * method.extent
+        within = replace(options, t_min=start, sh_degree=method.parts["glass"]._own_degree(self.step))
+        found: list[Tensor] = []
+        for leg in every.legs:
+            count, where = len(leg.length), self._pixels_of(every, leg)
+            origin, direction = leg.origin.double(), leg.direction.double()
+            limited = replace(within, t_max=leg.length.double().clamp_min(2 * start))
+            contents = self._trace("transmittance", origin, direction, limited, where)
+            leaving = origin + leg.length.double()[:, None] * direction
+            seen = self._trace("reflection", leaving, direction, options, where)
+            assert count == len(seen.alpha)
+            found.append(torch.cat((contents.colors, contents.alpha[:, None], seen.colors), 1))
+        result = []
+        for row, pixel in enumerate(rows.tolist()):
+            path = (every.pixels == pixel).nonzero()[:, 0]
+            if len(path) == 0:
+                result.append(behind[row])
+                continue
+            wall = thin_wall(every.cosine[path[0]], settings.wall.index)
+            result.append((1 - wall) * behind[row] + wall * self._along(every, found, 0, int(path[0])))
+        return torch.stack(result)
+
+    def _pixels_of(self, every: InnerPaths, leg: Leg) -> Tensor:
+        """The pixel of each row of a leg."""
+        pixels = every.pixels
+        for each in every.legs:
+            pixels = pixels[each.parent]
+            if each is leg:
+                return pixels
+        raise ValueError("the leg is of other paths")
+
+    def _along(self, every: InnerPaths, found: list[Tensor], level: int, row: int) -> Tensor:
+        """(3,) light that arrives along one leg: contents over what comes through the wall and what it mirrors."""
+        leg, met = every.legs[level], found[level][row]
+        wall = thin_wall(leg.cosine[row], self.settings.wall.index)
+        light = (1 - wall) * to_linear(met[4:])
+        if level + 1 < len(found):
+            on = (every.legs[level + 1].parent == row).nonzero()[:, 0]
+            if len(on):
+                light = light + wall * self._along(every, found, level + 1, int(on[0]))
+        return to_linear(met[:3] + (1 - met[3]) * to_srgb(light))
 
     def _surface(self) -> tuple[SurfacePixels, Tensor]:
         settings = self.method.settings
@@ -171,4 +243,7 @@ class GlassTwin:
             return first.colors + behind, first
         self.fragile[rows] |= (left.detach() - settings.opaque).abs() < 1e-4
         shown = left.detach() > settings.opaque
+        if self.thin:
+            light = self._mirrored_inside(to_linear(torch.where(shown[:, None], behind, 0.0)), rows)
+            return first.colors + left[:, None] * to_srgb(light), first
         return first.colors + torch.where(shown[:, None], left[:, None] * behind, 0.0), first

@@ -11,6 +11,7 @@ from glass_twin import GlassTwin, doubled
 
 from rtgs.gaussians.settings import MaterialSettings
 from rtgs.methods.settings import InterfaceSettings
+from rtgs.optics.settings import WallSettings
 from rtgs.train.method import Mode
 
 STEP = 40  # SH of degree 2 in the base set
@@ -31,14 +32,17 @@ CASES: dict[str, dict[str, object]] = {
 }
 
 
-@pytest.mark.parametrize("case", [*CASES, "raw directions, rgb f0", "linear light"])
+@pytest.mark.parametrize("case", [*CASES, "raw directions, rgb f0", "linear light", "thin glass"])
 def test_image_and_every_gradient_are_those_of_the_twins(case: str):
     made = glass_scene()
     settings = glass_recipe(**CASES.get(case, {}))
     materials = MaterialSettings(specular=0.3)
-    if case == "linear light":
+    if case in ("linear light", "thin glass"):
         settings = replace(settings, optics=replace(settings.optics, blend="linear"))
-    elif case not in CASES:
+    if case == "thin glass":
+        walls = WallSettings(light="fresnel", bounces=2)
+        settings = replace(settings, transmittance=replace(settings.transmittance, normal="mesh", wall=walls))
+    if case == "raw directions, rgb f0":
         settings = replace(settings, reflection=replace(settings.reflection, sh_direction="raw"))
         materials = replace(materials, f0_channels=3)
     method = begun(replace(settings, materials=materials), made)
