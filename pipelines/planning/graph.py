@@ -111,14 +111,15 @@ def _as_asked(config: RunConfig) -> RunConfig:
 
 
 def _left_out(config: RunConfig, transparency: Transparency, object_mesh: Step | None) -> tuple[Decision, ...]:
-    """What a run of a method with a third stage does without, and why."""
+    """What a run of a method with a stage for transparent objects does without, and why."""
+    stage = next((stage for stage in find_method(config.method.name).stages if stage.needs_object), None)
+    if stage is None:
+        return ()
     if object_mesh is None:
-        late = "method.transmittance.start leaves it no step"
-        why = late if transparency.present else transparency.why
-        left = next((stage for stage in find_method(config.method.name).stages if stage.needs_object), None)
-        return () if left is None else (Decision(train.kind_of(left).name, why),)
+        why = f"{stage.start_key} leaves it no step" if transparency.present else transparency.why
+        return (Decision(train.kind_of(stage).name, why),)
     if config.mesh.extract:
-        why = "extract_mesh makes the transparent object's mesh, which the third stage needs"
+        why = f"extract_mesh makes the transparent object's mesh, which the {stage.name} stage needs"
         return (Decision("scene mesh", why),)
     return ()
 

@@ -1,4 +1,4 @@
-"""Whether a run gets the third stage: known from the capture's masks before anything runs."""
+"""Whether a run gets the stage for transparent objects: known from the capture's masks before anything runs."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pipelines.planning.inspection import Inspection
 from pipelines.planning.preparation import Preparation
 from rtgs.config.schema import RunConfig
 from rtgs.mesh.settings import COVERED
-from rtgs.methods import find_method
+from rtgs.methods import StageSpec, find_method
 
 
 class Transparency(NamedTuple):
@@ -20,13 +20,16 @@ class Transparency(NamedTuple):
 
 def find_transparency(config: RunConfig, inspection: Inspection, prepared: Preparation) -> Transparency:
     """Look at the masks of the capture, as far as the first that bounds something. A step that makes masks is believed:
-    should they be empty, the third stage says so and changes nothing.
+    should they be empty, that stage says so and changes nothing.
 
     Raises:
         CaptureError: a mask cannot be read.
     """
-    if find_method(config.method.name).object_stage(config.method) is None:
-        return Transparency(False, "method.transmittance.enabled=false")
+    spec = find_method(config.method.name)
+    if spec.object_stage(config.method) is None:
+        off = next((stage for stage in spec.stages if stage.needs_object), None)
+        why = f"method {spec.name} has no stage for them" if off is None else _switched_off(off)
+        return Transparency(False, why)
     if any(step.name == "masks" for step in prepared.steps):
         return Transparency(True, "masks are made")
     files = inspection.mask_files
@@ -45,3 +48,7 @@ def find_transparency(config: RunConfig, inspection: Inspection, prepared: Prepa
         why = f"{full} of {len(files)} masks cover the whole picture{others}: nothing tells glass from room"
         return Transparency(False, why)
     return Transparency(False, f"all {len(files)} masks of the scene are empty")
+
+
+def _switched_off(stage: StageSpec) -> str:
+    return f"{stage.on_key} switches it off" if stage.on_key else f"the method's settings switch {stage.name} off"

@@ -128,4 +128,4 @@ def read_timed(folder: Path, times: RenderTimes, view_name: str, camera: Camera 
     return TimedRender(tensors["image"], times.of(view_name), *layers, tensors.get(GIVEN), *surface)
 
 
-STEP = StepKind("render", 3, render)
+STEP = StepKind("render", 4, render)

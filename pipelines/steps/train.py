@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from pipelines.steps.extract_mesh import why_absent
 from pipelines.steps.training import StageParams, last_training, load_method, train_stage
 from rtgs.methods import MethodSpec, StageSpec, find_method, is_own, own_methods
+from rtgs.train.networks import Named, check_networks, named_in_key
 from rtgs.workflow import Step, StepContext, StepKind
 from rtgs.workflow.fingerprint import file_digest, fingerprint
 
@@ -30,8 +31,11 @@ def train(params: StageParams, context: StepContext) -> None:
     goes on to the end, bit for bit as in a run without this one, and there is neither.
 
     Raises:
+        MissingWeights: the recipe names a network of the perceptual loss that is not on this machine.
+        WrongWeights: the networks here are others than those that the recipe names.
         TrainingDiverged: a loss or gradient is not finite.
     """
+    check_networks(params.method.loss, context.tools)
     if MESH_STEP not in context.inputs:
         train_stage(params, context)
     elif why := why_absent(context.inputs[MESH_STEP]):
@@ -76,16 +80,14 @@ def kind_of(stage: StageSpec) -> StepKind:
     return StepKind(f"train_{stage.name}", stage.version, train)
 
 
-def train_step(
-    spec: MethodSpec, params: StageParams, *upstream: Step, networks: tuple[tuple[str, str], ...] = ()
-) -> Step:
+def train_step(spec: MethodSpec, params: StageParams, *upstream: Step, networks: Named = ()) -> Step:
     """The step of one stage of a method.
 
-    ``networks``: (name, digest) of the pretrained files that are on this machine; they belong to the recipe where the
-    perceptual loss reads them. So does the source of a method from outside: no review of this project asks for a new
-    version when it changes.
+    ``networks``: (name, digest) of the pretrained files that are on this machine; those that the perceptual loss reads
+    belong to the recipe. So does the source of a method from outside: no review of this project asks for a new version
+    when it changes.
     """
-    tools = networks if params.method.loss.perceptual > 0 else ()
+    tools = named_in_key(params.method.loss, networks)
     if not is_own(spec):
         tools = (*tools, (f"method {spec.name}", _source_digest(spec)))
     return kind_of(spec.stage(params.stage)).step(params, *upstream, tools=tools)

@@ -46,12 +46,23 @@ def ellipsoid_normals(ellipsoids: Ellipsoids, camera_center: Tensor, residual: T
     Raises:
         ValueError: the residual is not (N, 3).
     """
-    scales = ellipsoids.log_scales.detach().clamp(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)
-    shortest = scales.argmin(dim=1)  # the first of equals
-    normals = ellipsoids.axes()[torch.arange(len(ellipsoids)), shortest]
+    scales = ellipsoids.log_scales.clamp(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)
+    return shortest_axes(ellipsoids.axes(), scales, ellipsoids.means, camera_center, residual)
+
+
+def shortest_axes(
+    axes: Tensor, sizes: Tensor, means: Tensor, camera_center: Tensor, residual: Tensor | None = None
+) -> Tensor:
+    """(N, 3) the normals of :func:`ellipsoid_normals`, for unit axes (N, 3, 3) of these sizes (N, 3) around the means.
+
+    Raises:
+        ValueError: the residual is not (N, 3).
+    """
+    shortest = sizes.detach().argmin(dim=1)  # the first of equals
+    normals = axes[torch.arange(len(axes)), shortest]
     if residual is not None:
         if residual.shape != normals.shape:
             raise ValueError(f"residual must be {tuple(normals.shape)}, got {tuple(residual.shape)}")
         normals = unit_or_zero(normals + residual)
-    away = (normals.detach() * (ellipsoids.means.detach() - camera_center.to(normals))).sum(dim=1) > 0
+    away = (normals.detach() * (means.detach() - camera_center.to(normals))).sum(dim=1) > 0
     return torch.where(away[:, None], -normals, normals)

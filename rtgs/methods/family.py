@@ -38,6 +38,7 @@ TRANSMITTANCE = StageSpec(
     _transmittance_start,
     "method.transmittance.start",
     on=_transmittance_on,
+    on_key="method.transmittance.enabled",
     needs_object=True,
     version=5,
 )

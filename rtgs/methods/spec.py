@@ -58,6 +58,7 @@ class StageSpec:
         start_key: the config key that ``start`` reads, for messages.
         reads: the settings with fixed values where the stage reads nothing: runs that differ there share its artifact.
         on: whether the settings ask for the stage.
+        on_key: the config key that ``on`` reads, for messages.
         needs_object: only for scenes with a transparent object, whose mesh is made before the stage.
         version: of the step, raised when the stage trains otherwise than before.
     """
@@ -67,6 +68,7 @@ class StageSpec:
     start_key: str = ""
     reads: Reads = everything
     on: Callable[[MethodSettings], bool] = always
+    on_key: str = ""
     needs_object: bool = False
     version: int = 1
 

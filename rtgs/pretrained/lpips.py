@@ -19,7 +19,7 @@ from torch.nn import functional
 
 from rtgs.core.image_pair import checked_pair
 from rtgs.pretrained.vgg import Vgg16Features
-from rtgs.pretrained.weights import LPIPS_VGG, VGG16, WrongWeights, find_weights, read_tensors, verify_weights
+from rtgs.pretrained.weights import LPIPS_VGG, WrongWeights, find_weights, read_tensors, verify_weights
 
 # LPIPS v0.1: ImageNet's mean and standard deviation, for inputs in [-1, 1].
 SHIFT = (-0.030, -0.088, -0.188)
@@ -65,13 +65,10 @@ class Lpips(nn.Module):
             MissingWeights: a file is not on this machine.
             WrongWeights: a file is not what it should be (``verify`` compares the SHA-256 of registered files).
         """
-        vgg_path = vgg or find_weights(VGG16)
+        features = Vgg16Features.load(vgg, verify=verify)
         heads_path = heads or find_weights(LPIPS_VGG)
-        if verify and vgg is None:
-            verify_weights(VGG16, vgg_path)
         if verify and heads is None:
             verify_weights(LPIPS_VGG, heads_path)
-        features = Vgg16Features(read_tensors(vgg_path), str(vgg_path))
         return cls(features, read_tensors(heads_path), str(heads_path))
 
     def forward(self, image: Tensor, target: Tensor, input_range: InputRange = InputRange.MINUS_ONE_ONE) -> Tensor:

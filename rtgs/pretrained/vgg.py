@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from rtgs.pretrained.weights import WrongWeights
+from rtgs.pretrained.weights import VGG16, WrongWeights, find_weights, read_tensors, verify_weights
 
 # Positions of the convolutions in torchvision's `features` sequence, by block; a 2x2 max pool opens blocks 2 to 5.
 BLOCKS: tuple[tuple[int, ...], ...] = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))
@@ -37,6 +38,19 @@ class Vgg16Features(nn.Module):
         self.widths = tuple(widths)
         self.requires_grad_(False)
         self.eval()
+
+    @classmethod
+    def load(cls, path: Path | None = None, *, verify: bool = True) -> Vgg16Features:
+        """From a file; by default the registered one, found by :func:`rtgs.pretrained.weights.find_weights`.
+
+        Raises:
+            MissingWeights: the file is not on this machine.
+            WrongWeights: it is not what it should be (``verify`` compares the SHA-256 of the registered file).
+        """
+        found = path or find_weights(VGG16)
+        if verify and path is None:
+            verify_weights(VGG16, found)
+        return cls(read_tensors(found), str(found))
 
     def _add(self, tensors: Mapping[str, Tensor], position: int, channels: int, origin: str) -> int:
         """Take over one convolution; returns its output channels."""

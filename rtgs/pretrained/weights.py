@@ -51,7 +51,7 @@ VGG16 = PretrainedFile(
     megabytes=528.0,
     licence="torchvision BSD-3-Clause; trained on ImageNet, whose terms are for research",
     source="torchvision's model page for VGG16_Weights.IMAGENET1K_V1 (download.pytorch.org/models/vgg16-397923af.pth)",
-    used_for="the feature stack of LPIPS",
+    used_for="the features of LPIPS and of the perceptual loss",
 )
 LPIPS_VGG = PretrainedFile(
     name="lpips_vgg",

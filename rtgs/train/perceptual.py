@@ -1,4 +1,4 @@
-"""L_perc on random crops (method.md 5; decision 20). Only where the pretrained VGG-16 is on this machine."""
+"""L_perc on random crops (method.md 5; decision 20). Only where the networks of its form are on this machine."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from rtgs.pretrained.lpips import InputRange, Lpips
-from rtgs.pretrained.weights import LPIPS_VGG, VGG16, find_weights
+from rtgs.pretrained.lpips import SCALE, SHIFT, InputRange, Lpips
+from rtgs.pretrained.vgg import Vgg16Features
+from rtgs.pretrained.weights import find_weights
+from rtgs.train.networks import networks_of
 from rtgs.train.settings import LossSettings
 
 
@@ -19,17 +21,20 @@ class PerceptualLoss:
         """``network``: default the registered one, read at the first use.
 
         Raises:
-            MissingWeights: a pretrained file is not on this machine.
+            MissingWeights: a pretrained file that the form reads is not on this machine.
         """
         self._settings = settings
         self._given = network
-        if network is None:
-            find_weights(VGG16)
-            find_weights(LPIPS_VGG)
+        for file in networks_of(settings) if network is None else ():
+            find_weights(file)
 
     @cached_property
     def network(self) -> Lpips:
         return self._given or Lpips.load()
+
+    @cached_property
+    def features(self) -> Vgg16Features:
+        return self._given.features if self._given else Vgg16Features.load()
 
     def __call__(self, image: Tensor, target: Tensor, generator: torch.Generator) -> Tensor:
         """Scalar, differentiable in ``image`` (3, H, W); ``target`` alike, both in [0, 1]."""
@@ -45,7 +50,7 @@ class PerceptualLoss:
 
     def _feature_distance(self, image: Tensor, target: Tensor) -> Tensor:
         """The paper's form: mean L1 distance of raw features, mean over the five blocks."""
-        shift, scale = (self.network.get_buffer(name) for name in ("shift", "scale"))
-        activations = self.network.features((torch.stack((image, target)) - shift) / scale)
+        shift, scale = (torch.tensor(values).view(1, 3, 1, 1) for values in (SHIFT, SCALE))
+        activations = self.features((torch.stack((image, target)) - shift) / scale)
         distances = [(activation[0] - activation[1]).abs().mean() for activation in activations]
         return torch.stack(distances).mean()

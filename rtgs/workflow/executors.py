@@ -162,7 +162,8 @@ class InlineExecutor:
             with self.tracking.run(info) as tracker:
                 tracker.params({key: _scalar(value) for key, value in flatten(step.recipe).items()})
                 messages = logging.getLogger(f"rtgs.{step.name}")
-                context = StepContext(inputs, attempt, partial, messages, tracker, executed, self.artifacts, self.quiet)
+                shared = (self.artifacts, self.quiet, step.tools)
+                context = StepContext(inputs, attempt, partial, messages, tracker, executed, *shared)
                 step.run(step.params, context)
                 return self.store.publish(step, attempt, time.perf_counter() - start)
         except Exception as error:

@@ -35,6 +35,7 @@ class StepContext:
             telling people: a result must not depend on it.
         artifacts: what steps of this run have read of artifacts already; see :meth:`read`.
         quiet: another process shows how far the plan is, so this step draws no display of its own.
+        tools: what the recipe names of outside tools (:class:`Step`). A step refuses to run with others.
     """
 
     inputs: dict[str, Path]
@@ -45,6 +46,7 @@ class StepContext:
     executed: frozenset[str] = frozenset()
     artifacts: Artifacts = field(default_factory=Artifacts)
     quiet: bool = False
+    tools: tuple[tuple[str, str], ...] = ()
 
     def read(self, name: str, reader: Callable[[Path], T]) -> T:
         """The artifact of the step ``name`` through ``reader``; read once for all steps of a run, so never changed."""

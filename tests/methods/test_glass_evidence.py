@@ -4,6 +4,7 @@ into it; and what the third stage makes of it."""
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -14,13 +15,15 @@ from torch import Tensor
 from benchmarks.common.mirror_scene import BALL, RADIUS, ball_hit
 from rtgs.core.cameras import Camera
 from rtgs.mesh.container import ObjectGuide, ObjectSurfaces
-from rtgs.methods import Mode, RenderOptions
+from rtgs.methods import Mode, RenderOptions, Stage
 from rtgs.methods.model import Model
 from rtgs.methods.parts.glass_evidence import glass_faces, on_surface, seen_bare
 from rtgs.methods.parts.interface_set import normal_quaternions
 from rtgs.methods.shading.mirror import SurfacePixels
 from rtgs.methods.shading.straight import glass_pixels, widened
 from rtgs.scenes.scene import View
+from rtgs.train.checkpoint import save_checkpoint
+from rtgs.train.trainer import Trainer
 
 LABEL = -0.1  # of the radius: above this height the ball is covered
 VOTED = replace(INTERFACE, masked_share=0.5)
@@ -155,6 +158,43 @@ def test_an_opaque_thing_under_masks_is_left_alone(plain: GlassScene):
     again.load(method.state())
     assert again.decisions[-1] == method.decisions[-1]
     assert again.parts["glass"].mask(view) is None
+
+
+@pytest.mark.parametrize(("killed_at", "resumed_from"), [(37, 30), (43, 40), (59, 50)])
+def test_a_killed_run_that_left_the_stage_out_goes_on_bit_for_bit(
+    plain: GlassScene, tmp_path: Path, killed_at: int, resumed_from: int
+):
+    """From before the verdict and from after it, through resets and density control of the second stage."""
+
+    def trainer(method: Model, folder: str) -> Trainer:
+        return Trainer(method, plain.scene, seed=3, stage=method.stages[2], checkpoint_dir=tmp_path / folder)
+
+    for folder in ("whole", "killed"):
+        second = Trainer(_with_skin(plain), plain.scene, seed=3, stage=Stage("reflection", 30, 30))
+        save_checkpoint(tmp_path / folder, second.checkpoint())  # what the third stage goes on from
+    whole, dying = (new_glass_method(glass_recipe(), plain) for _ in range(2))
+    summary = trainer(whole, "whole").run()
+    after_step = dying.after_step
+
+    def interrupted(step: int, observations):
+        if step == killed_at:
+            raise KeyboardInterrupt
+        return after_step(step, observations)
+
+    dying.after_step = interrupted  # type: ignore[method-assign]
+    with pytest.raises(KeyboardInterrupt):
+        trainer(dying, "killed").run()
+    again = new_glass_method(glass_recipe(), plain)
+    resumed = trainer(again, "killed").run()
+    assert (summary.resumed_from, resumed.resumed_from) == (30, resumed_from)
+    assert [decision.what for decision in resumed.decisions][-1] == "no transmittance stage"
+    assert resumed.decisions == summary.decisions
+    assert resumed.psnr_test == summary.psnr_test
+    expected, found = whole.state(), again.state()
+    assert expected.keys() == found.keys()
+    assert "third_stage_left_out" in expected
+    assert not [name for name in expected if name.startswith(("transmittance.", "interface."))]
+    assert [name for name, tensor in expected.items() if not torch.equal(tensor, found[name])] == []
 
 
 def _with_skin(made: GlassScene) -> Model:

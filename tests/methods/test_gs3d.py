@@ -45,13 +45,17 @@ def test_losses_that_need_a_surface_are_refused(name: str):
 
 def test_maps_that_need_a_surface_are_refused():
     method, scene = make(ELLIPSOIDS)
-    assert method.maps == ("depth",)
-    with pytest.raises(ValueError, match="Ellipsoids render no normal: their maps are depth"):
-        method.render(scene.test[0].camera, 0, Mode.EVALUATE, RenderOptions(depth=True, normal=True))
+    assert method.maps == ("depth", "normal")
+    camera = scene.test[0].camera
+    with pytest.raises(ValueError, match="Ellipsoids render no median_depth, distortion: their maps are depth, normal"):
+        method.render(camera, 0, Mode.EVALUATE, RenderOptions(normal=True, median_depth=True, distortion=True))
     with torch.no_grad():
-        buffers = method.render(scene.test[0].camera, 0, Mode.EVALUATE, RenderOptions(depth=True)).buffers
-    assert buffers.depth is not None
-    assert buffers.normal is None
+        found = [method.render(camera, 0, Mode.EVALUATE, RenderOptions(depth=True, normal=n)) for n in (False, True)]
+    assert all(rendered.buffers.depth is not None for rendered in found)
+    assert [rendered.buffers.normal is not None for rendered in found] == [False, True]
+    trained = method.render(camera, 0, Mode.TRAIN)
+    assert trained.buffers.normal is None, "no loss of this method asks for it"
+    assert len(trained.buffers.features) == 3
 
 
 def test_antialiasing_is_a_setting_that_training_and_test_views_obey():

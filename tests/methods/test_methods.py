@@ -9,6 +9,7 @@ import torch
 from training_cases import HEIGHT, WIDTH, small_method, small_scene, small_schedule
 
 from rtgs.core.errors import RtgsError
+from rtgs.gaussians.channels import Channel
 from rtgs.gaussians.settings import DensitySettings
 from rtgs.methods import Mode, RenderOptions, Setup, Stage, create_method, find_method, method_names
 from rtgs.methods import losses as method_losses
@@ -251,6 +252,26 @@ def test_a_state_of_another_method_is_refused():
     state = {name.replace("base.", "other."): tensor for name, tensor in method.state().items()}
     with pytest.raises(ValueError, match=r"no base\.surfels\.means"):
         method.load(state)
+
+
+def test_a_channel_of_the_state_that_the_set_lacks_is_refused_and_changes_nothing():
+    """Else what was trained of it would be lost in silence; whoever owns the set brings it there first."""
+    gloss = Channel("gloss_logits", 0.25, "sigmoid", rate=0.5)
+    method, _ = make()
+    (part,) = method.sets
+    plain = part.gaussians
+    part.adopt(plain.with_channels(gloss, replace(gloss, name="coat")))
+    state = {name: tensor.detach().clone() for name, tensor in part.state().items()}
+    part.adopt(plain.with_channels(gloss))
+    before = {name: tensor.clone() for name, tensor in part.state().items()}
+    message = r"has base\.surfels\.coat, but set 'base' lacks this channel \(it has gloss_logits\): the `restore` of"
+    with pytest.raises(ValueError, match=message):
+        part.load(state)
+    assert all(torch.equal(tensor, before[name]) for name, tensor in part.state().items())
+    part.adopt(part.gaussians.with_channels(replace(gloss, name="coat")))  # as a part's restore does
+    part.load(state)
+    assert part.state().keys() == state.keys()
+    assert torch.equal(part.gaussians["coat"], state["base.surfels.coat"])
 
 
 def test_a_gain_of_zero_leaves_a_term_out():

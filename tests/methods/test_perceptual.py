@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -10,6 +11,7 @@ from reflective_cases import new_method, recipe, schedule, tiny
 from test_lpips import TINY, head_tensors, vgg_tensors
 
 from rtgs.methods import Mode, Stage, losses
+from rtgs.pretrained import vgg, weights
 from rtgs.pretrained.lpips import InputRange, Lpips
 from rtgs.pretrained.vgg import Vgg16Features
 from rtgs.pretrained.weights import MissingWeights
@@ -46,6 +48,19 @@ def test_a_crop_gets_the_gradient_and_the_rest_of_the_image_none(network: Lpips,
     assert float(value.detach()) > 0
     assert (touched.max(0).values - touched.min(0).values + 1).tolist() == [32, 32]
     assert float(loss(target, target, torch.Generator())) == pytest.approx(0, abs=1e-9)
+
+
+def test_raw_features_need_no_heads_of_lpips(network: Lpips, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(weights, "weight_folders", lambda: (tmp_path,))
+    monkeypatch.setattr(vgg, "verify_weights", lambda file, path: None)  # a tiny one in the place of the published
+    form = LossSettings(perceptual=0.01, perceptual_form="vgg_l1", perceptual_crop=32)
+    with pytest.raises(MissingWeights, match="vgg16"):
+        PerceptualLoss(form)
+    torch.save(vgg_tensors(TINY), tmp_path / weights.VGG16.filename)
+    found, given = (PerceptualLoss(form, each)(*pair(), torch.Generator().manual_seed(2)) for each in (None, network))
+    assert torch.equal(found, given)
+    with pytest.raises(MissingWeights, match=r"lpips_v0\.1/vgg\.pth"):
+        PerceptualLoss(replace(form, perceptual_form="lpips"))
 
 
 def test_every_place_of_the_image_is_drawn(network: Lpips):

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from rtgs.core.decisions import Decision
 from rtgs.gaussians.initialize import gaussians_from_points
+from rtgs.gaussians.normals import NORMAL_RESIDUAL
 from rtgs.gaussians.primitives import Gaussians
 from rtgs.gaussians.settings import DensitySettings, McmcSettings
 from rtgs.gaussians.surfels import ActivatedGaussians
@@ -125,11 +126,19 @@ class BaseSet(Part):
             torch.nn.functional.pad(self._background, (0, features.shape[1] - 3)),
             self.settings.render,
             self.extent,
+            self._normal_residual(more) if wanted.normal else None,
         )
         buffers = self.kind.rasterize(shape, features, request)
         if probe is None or buffers.weight_sum is None:
             return Raster(buffers)
         return Raster(buffers, (Observation(self.name, probe, buffers.weight_sum[: len(self.set)]),))
+
+    def _normal_residual(self, more: int) -> Tensor | None:
+        """That of the set's channel, and 0 for ``more`` rows behind it."""
+        gaussians = self.set.gaussians
+        if NORMAL_RESIDUAL not in gaussians:
+            return None
+        return torch.nn.functional.pad(gaussians.activated(NORMAL_RESIDUAL), (0, 0, 0, more))
 
     def shade(self, frame: Frame, raster: Raster) -> RenderedView:
         """The view as it is rasterised."""

@@ -122,7 +122,7 @@ class GaussianSet:
         """Take over the tensors of :meth:`state`, whatever the number of rows now.
 
         Raises:
-            ValueError: a parameter of this set is missing in ``state``.
+            ValueError: a parameter of this set is missing in ``state``, or the state has a channel that this set lacks.
         """
 
         def part(key: str) -> dict[str, Tensor]:
@@ -130,6 +130,7 @@ class GaussianSet:
             return {name[len(prefix) :]: tensor for name, tensor in state.items() if name.startswith(prefix)}
 
         parameters = part("surfels")
+        self._refuse_more(parameters)
         for name, _ in self.gaussians.items():
             if name not in parameters:
                 raise ValueError(
@@ -140,6 +141,15 @@ class GaussianSet:
         self.optimizer = self._new_optimizer()  # moments of the loaded number of rows
         self.optimizer.load(part("adam"))
         self.density.load(part("density"))
+
+    def _refuse_more(self, parameters: Mapping[str, Tensor]) -> None:
+        if more := sorted(name for name in parameters if name not in self.gaussians):
+            held = ", ".join(channel.name for channel in self.gaussians.channels) or "none"
+            raise ValueError(
+                f"the checkpoint has {self.name}.surfels.{more[0]}, but set {self.name!r} lacks this channel (it has "
+                f"{held}): the `restore` of the part that owns the set must first bring it to the channels of the "
+                "state, with `GaussianSet.adopt` or as a new set"
+            )
 
 
 def densified(

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from rtgs.core.cameras import Camera
 from rtgs.gaussians.ellipsoids import Ellipsoids
+from rtgs.gaussians.normals import shortest_axes
 from rtgs.gaussians.primitives import Gaussians
 from rtgs.gaussians.surfels import ActivatedGaussians, Surfels
 from rtgs.render.buffers import EllipsoidOptions, RasterBuffers, RasterOptions
 from rtgs.render.ellipsoids import rasterize_ellipsoids
+from rtgs.render.features import NORMAL, FeatureLayout
 from rtgs.render.settings import RenderSettings
 from rtgs.render.surfels import rasterize_surfels
 from rtgs.train.method import RenderOptions
@@ -29,6 +33,7 @@ class RasterRequest:
     background: Tensor  # (C,) of the features
     settings: RenderSettings
     extent: float  # of the scene, world units: near and far are shares of it
+    normal_residual: Tensor | None = None  # (N, 3) of the normals of ellipsoids, where the set has one
 
 
 Rasterize = Callable[[ActivatedGaussians, Tensor, RasterRequest], RasterBuffers]
@@ -82,6 +87,24 @@ def _surfels(rows: ActivatedGaussians, features: Tensor, request: RasterRequest)
 
 
 def _ellipsoids(rows: ActivatedGaussians, features: Tensor, request: RasterRequest) -> RasterBuffers:
+    """Where the map of normals is wanted, they are composited as three features more (docs/rasterizer.md)."""
+    if not request.wanted.normal:
+        return _composited(rows, features, request)
+    layout = FeatureLayout(("features", NORMAL), (features.shape[1], 3))
+    features = layout.join({"features": features, NORMAL: _facing_normals(rows, request)})
+    buffers = _composited(rows, features, replace(request, background=pad(request.background, (0, 3))))
+    maps = layout.split(buffers.features)
+    return replace(buffers, features=maps["features"], normal=maps[NORMAL])
+
+
+def _facing_normals(rows: ActivatedGaussians, request: RasterRequest) -> Tensor:
+    """(N, 3) of activated ellipsoids, as :func:`rtgs.gaussians.normals.ellipsoid_normals` gives them of raw ones."""
+    third = torch.linalg.cross(rows.tangent_u, rows.tangent_v, dim=1)
+    axes = torch.stack((rows.tangent_u, rows.tangent_v, third), dim=1)
+    return shortest_axes(axes, rows.scales, rows.means, request.camera.center, request.normal_residual)
+
+
+def _composited(rows: ActivatedGaussians, features: Tensor, request: RasterRequest) -> RasterBuffers:
     settings = request.settings
     buffers = rasterize_ellipsoids(
         rows.means,
@@ -105,4 +128,4 @@ def _ellipsoids(rows: ActivatedGaussians, features: Tensor, request: RasterReque
 
 
 SURFELS = GaussianKind(Surfels, ("depth", "median_depth", "normal", "distortion"), _surfels)
-ELLIPSOIDS = GaussianKind(Ellipsoids, ("depth",), _ellipsoids)
+ELLIPSOIDS = GaussianKind(Ellipsoids, ("depth", "normal"), _ellipsoids)

@@ -27,9 +27,7 @@ class Light:
     color_name: str  # of the layer with the colour alone
     weight: Tensor  # (P,) or (3, P) w
     color: Tensor  # (3, P) C, in the encoding of the photos
-    parts: Mapping[str, Tensor] = field(
-        default_factory=dict
-    )  # (3, P) linear light: C by where it is from
+    parts: Mapping[str, Tensor] = field(default_factory=dict)  # (3, P) linear light: C by where it is from
 
 
 @dataclass(frozen=True)

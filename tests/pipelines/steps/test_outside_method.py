@@ -13,8 +13,7 @@ from safetensors.torch import load_file
 
 from pipelines.cli.main import main
 from pipelines.planning.graph import build_graph
-from pipelines.steps.train import train_step
-from pipelines.steps.training import StageParams, stage_params
+from pipelines.steps.training import stage_params
 from rtgs.config import compose
 from rtgs.core.errors import RtgsError
 from rtgs.methods import create_method, find_method, method_names
@@ -157,15 +156,3 @@ def test_an_entry_point_gives_it_a_plain_name(on_path, monkeypatch: pytest.Monke
     monkeypatch.setattr(metadata, "entry_points", lambda group: [declared] if group == "rtgs.methods" else [])
     assert find_method("exposure").name == "exposure"
     assert method_names() == ("2dgs", "3dgs", "envgs", "rtgs", "exposure")
-
-
-def test_networks_belong_to_the_recipe_where_the_loss_reads_them():
-    spec = find_method("rtgs")
-    keys = {}
-    for weight in (0.0, 0.01):
-        for networks in ((), (("vgg16", "1" * 64),)):
-            method = MethodSettings(name="rtgs", loss=LossSettings(perceptual=weight))
-            params = StageParams(method, small_schedule(30), 0, "reflection", 10, 30)
-            keys[weight, bool(networks)] = train_step(spec, params, networks=networks).fingerprint
-    assert keys[0.0, False] == keys[0.0, True]
-    assert keys[0.01, False] != keys[0.01, True]

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from safetensors.torch import load_file
 
 from pipelines.cli.main import main
 from pipelines.steps import pictures
@@ -62,6 +63,20 @@ def test_looking_changes_nothing(trained):
     assert first.fingerprint == second.fingerprint
     for name in ("base.ply", "reflection.ply"):
         assert first.files[name] == second.files[name]
+
+
+def test_ellipsoids_show_their_normals(capture, tmp_path: Path, monkeypatch):  # noqa: F811
+    monkeypatch.setenv("RTGS_ROOT", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(pictures, "LEAST_STEPS", 4)
+    assert main(["run", f"scene={capture}", "method=3dgs", *QUICK, "tracking=jsonl", "name=round"]) == 0
+    assert tracked_images(tmp_path)["images_000/normal"] == [4, 8, 12]
+    (rendered,) = Store(tmp_path / "store").artifacts("render")
+    maps = load_file(next((rendered.folder / "views").iterdir()))
+    assert set(maps) == {"image", "depth", "normal", "alpha"}
+    assert bool((maps["normal"].norm(dim=0) <= maps["alpha"] + 1e-5).all())
+    assert bool(maps["normal"].any())
+    assert "<b>Normal</b>" in (tmp_path / "runs" / "round" / "report.html").read_text()
 
 
 def test_a_run_that_finds_its_training_cached_has_the_sliders_too(trained, capture, monkeypatch):  # noqa: F811

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -110,7 +111,50 @@ def test_only_scenes_with_masks_that_show_something_get_the_third_stage(glass: P
     two = graph_of(glass, "ablation=two_stages")
     assert [step.name for step in two.training] == ["train_diffuse", "train_reflection"]
     assert two.training[-1].params.until == 12
+    off = ("train_transmittance", "method.transmittance.enabled switches it off")
+    assert off in {(step.what, step.why) for step in two.skipped}
+    late = graph_of(glass, "method.transmittance.start=1")
+    assert ("train_transmittance", "method.transmittance.start leaves it no step") in {
+        (step.what, step.why) for step in late.skipped
+    }
     assert not any(step.what == "train_transmittance" for step in graph_of(glass, "method=2dgs").skipped)
+
+
+OWN_KEYS = """
+from dataclasses import replace
+from rtgs.methods import MethodSpec
+from rtgs.methods.family import DIFFUSE, TRANSMITTANCE
+
+def at_the_end(settings, schedule):
+    return schedule.total
+
+def never(settings):
+    return False
+
+def build(setup):
+    raise AssertionError("a plan composes no model")
+
+LATE = replace(TRANSMITTANCE, name="haze", start=at_the_end, start_key="method.reflection.cells")
+OFF = replace(LATE, on=never, on_key="method.reflection.per_cell")
+SPECS = [MethodSpec("hazy", (DIFFUSE, stage), build) for stage in (LATE, OFF, replace(OFF, on_key=""))]
+LATE, OFF, KEYLESS = SPECS
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("LATE", "method.reflection.cells leaves it no step"),
+        ("OFF", "method.reflection.per_cell switches it off"),
+        ("KEYLESS", "the method's settings switch haze off"),
+    ],
+)
+def test_a_stage_of_another_method_is_left_out_with_its_own_key(glass: Path, tmp_path: Path, monkeypatch, name, why):
+    (tmp_path / "hazy_method.py").write_text(OWN_KEYS)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    graph = graph_of(glass, f"method.name='hazy_method:{name}'")
+    sys.modules.pop("hazy_method")
+    assert [(step.what, step.why) for step in graph.skipped if step.what == "train_haze"] == [("train_haze", why)]
 
 
 def _same_run(run: RunGraph, two_stages: RunGraph) -> None:
