@@ -11,7 +11,7 @@ from torch import Tensor
 from training_cases import look_at_origin, small_method, small_scene, small_schedule
 
 from rtgs.core.cameras import Camera
-from rtgs.gaussians.activate import activate_surfels
+from rtgs.gaussians.activate import activate_gaussians
 from rtgs.gaussians.channels import Channel
 from rtgs.gaussians.ellipsoids import Ellipsoids
 from rtgs.gaussians.normals import NORMAL_RESIDUAL, normal_residual_channel
@@ -41,7 +41,7 @@ def gaussians(kind: type[Gaussians], means: Tensor, quaternions: Tensor, size: f
 
 
 def shown(kind: GaussianKind, made: Gaussians, wanted: RenderOptions = WANTED, channels: int = 3) -> RasterBuffers:
-    rows = activate_surfels(made, CAMERA.center.float(), 0)
+    rows = activate_gaussians(made, CAMERA.center.float(), 0)
     background = torch.full((channels,), 0.5)
     request = RasterRequest(CAMERA, wanted, False, None, background, RenderSettings(), 4.4)
     return kind.rasterize(rows, rows.colors[:, :1].expand(-1, channels), request)
@@ -180,7 +180,7 @@ def test_rows_that_a_part_appends_have_normals_without_a_residual():
     frame = Frame(camera, 0, Mode.EVALUATE, WANTED)
     more = gaussians(Ellipsoids, torch.zeros(1, 3), turned(0.0), size=1.0)
     more.opacity_logits = torch.full((1,), 9.0)
-    shape = activate_surfels(more, camera.center.float(), 0)
+    shape = activate_gaussians(more, camera.center.float(), 0)
     in_front = replace(shape, means=0.8 * camera.center.float()[None])
     rows = Rows(in_front, shape.colors)
     with torch.no_grad():
