@@ -5,6 +5,7 @@ A method's module chooses from them, and may add terms of its own.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
@@ -212,13 +213,11 @@ def glass_terms(setup: Setup, glass: Glass) -> Terms:
         return mesh_normal_loss(rendered.buffers.normal, surfaces.normal, transparent & glass.on_glass(surfaces))
 
     until = loss_start(interface.normal_loss_until, setup.schedule.total)
-    found = (
-        ("transmission_depth", loss.transmission_depth, depth, None),
-        ("interface_hold", interface.normal_hold, hold, until),
-        ("interface_normal", interface.normal_loss, normal, until),
+    terms = (
+        ("transmission_depth", loss.transmission_depth, depth, math.inf, RenderOptions()),
+        ("interface_hold", interface.normal_hold, hold, until, RenderOptions()),
+        ("interface_normal", interface.normal_loss, normal, until, RenderOptions(normal=True)),
     )
     return [
-        LossTerm(name, weight, value) if end is None else LossTerm(name, weight, value, until=end)
-        for name, weight, value, end in found
-        if weight > 0
+        LossTerm(name, weight, value, until=end, needs=needs) for name, weight, value, end, needs in terms if weight > 0
     ]

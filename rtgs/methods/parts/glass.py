@@ -19,12 +19,12 @@ from rtgs.mesh.silhouettes import bounding
 from rtgs.methods.parts.base import BaseSet, composited
 from rtgs.methods.parts.gaussian_set import GaussianSet, densified, opacity_reset
 from rtgs.methods.parts.glass_evidence import glass_faces, has_masks, on_surface, seen_bare
+from rtgs.methods.parts.glass_sets import drawn_in_box, interface_set, taken_from_base, transmittance_set
 from rtgs.methods.parts.interface_set import InterfaceSet, interface_surfels
 from rtgs.methods.parts.mirror import Mirror, Reflected, stored_surfels
 from rtgs.methods.parts.part import Frame, Part, Raster, Rows
 from rtgs.methods.parts.straight_rays import FarWall, StraightRays
 from rtgs.methods.parts.traced_set import FollowingTree, TracedSet
-from rtgs.methods.parts.transmittance_init import initial_box, random_surfels, rows_inside, take_out
 from rtgs.methods.parts.wall_light import InnerRays, WallLight
 from rtgs.methods.plans import transmittance_plan
 from rtgs.methods.shading.lights import Light, Traced, lit_view
@@ -197,55 +197,21 @@ class Glass(Part):
         return found
 
     def _add_transmittance(self, mesh: ObjectMesh, kept: Tensor) -> StepEvent:
-        settings, cameras = self.settings.transmittance, [view.camera for view in self._views]
-        base = self.base.set
-        where = "behind the pane" if mesh.flat else "inside the object"
-        inside = torch.zeros(len(base), dtype=torch.bool)
-        if settings.split:
-            assert isinstance(base.gaussians, Surfels)
-            inside = rows_inside(base.gaussians, mesh, settings.split_margin * mesh.voxel, cameras)
-        found = int(inside.sum())
-        some_stay = mesh.flat or found < len(inside)
-        if settings.init.min_points <= found and some_stay:
-            kept = torch.ones_like(kept) if mesh.flat else kept  # what is behind a pane is seen beside it, too
-            surfels, detail = take_out(base, inside, kept), f"{found} base surfels {where}"
-            if mesh.flat:
-                detail = f"copies of {detail}"
-            elif both := int((inside & kept).sum()):
-                detail += f", {both} of them seen bare too: they also stay in the base set"
-            self._from_base = True
-            self._base_tree.clear()
+        cameras = [view.camera for view in self._views]
+        taken = taken_from_base(self.settings, self.base.set, mesh, cameras, kept)
+        if taken.surfels is None:
+            surfels, detail = drawn_in_box(self.settings, mesh, cameras, self._points, taken, self.generator)
         else:
-            box = initial_box(settings, mesh, cameras, self._points)
-            surfels = random_surfels(settings, box, self.generator)
-            many = f"only {found}" if some_stay else f"all {found}"
-            why = f", for {many} base surfels are {where}" if settings.split else ""
-            detail = f"{len(surfels)} random surfels in the box of the {settings.box}{why}"
+            surfels, detail, self._from_base = taken.surfels, taken.detail, True
+            self._base_tree.clear()
         self.transmittance = self._transmittance_set(surfels)
         return StepEvent("begin", "transmittance", detail)
 
     def _transmittance_set(self, surfels: Surfels) -> TracedSet:
-        settings = self.settings.transmittance
-        return TracedSet(
-            "transmittance",
-            surfels,
-            optimizer=self.settings.optimizer.learning_faster(settings.rate_gain),
-            density=settings.density,
-            means_lr_steps=self.plan.own.means_lr_steps,
-            extent=self.extent,
-            rebuild_every=settings.rebuild_every,
-        )
+        return transmittance_set(self.settings, surfels, self.plan.own.means_lr_steps, self.extent)
 
     def _interface_set(self, surfels: Surfels) -> InterfaceSet:
-        made = InterfaceSet(
-            "interface",
-            surfels,
-            optimizer=self.settings.optimizer,
-            density=self.settings.density,
-            means_lr_steps=self.schedule.means_lr_steps,
-            extent=self.extent,
-        )
-        return made.put(self.settings.transmittance.interface.floor)
+        return interface_set(self.settings, surfels, self.schedule.means_lr_steps, self.extent)
 
     # ---- rendering
 
