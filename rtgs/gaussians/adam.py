@@ -122,13 +122,17 @@ class GaussianAdam:
         self.second = _zeros_like(gaussians)
 
     def learning_rates(self, step_index: int) -> dict[str, float]:
-        """Rate of each parameter at a step (from 0); that of the means decays exponentially and is in world units."""
+        """Rate of each parameter at a step (from 0); that of the means decays exponentially and is in world units.
+
+        The others are constant, or fall as :meth:`OptimizerSettings.decay` says.
+        """
         s = self.settings
         share = min(max(step_index / self.means_lr_steps, 0.0), 1.0)
         means = math.exp((1 - share) * math.log(s.means_initial) + share * math.log(s.means_final))
-        rates = {name: getattr(s, name) for name in PARAMETERS if name != "means"} | {"means": means * self.extent}
-        channels = self.gaussians.channels
-        return rates | {c.name: getattr(s, c.name) if c.rate is None else c.rate for c in channels}
+        rates = {name: getattr(s, name) for name in PARAMETERS if name != "means"}
+        rates |= {c.name: getattr(s, c.name) if c.rate is None else c.rate for c in self.gaussians.channels}
+        factor = s.decay(share)
+        return {name: factor * rate for name, rate in rates.items()} | {"means": means * self.extent}
 
     def step(self, step_index: int, sh_degree: int | None = None) -> None:
         """Update every parameter in place from its ``.grad`` (parameters without one are left alone).

@@ -8,6 +8,7 @@ from typing import TypeVar
 import numpy as np
 import torch
 from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from rtgs.core.errors import RtgsError
@@ -44,7 +45,7 @@ def gaussians_from_points(
     box: Tensor | None = None,
     channels: tuple[Channel, ...] = (),
 ) -> Kind:
-    """One Gaussian for each point: round, scale from its neighbours, colour from the point, orientation random or none.
+    """One Gaussian for each point: round, scale from its neighbours, colour from the point, orientation as asked for.
 
     Points with a NaN or inf coordinate are left out. With ``settings.random_points`` > 0 the points are replaced by
     that many uniform random ones of random colour in ``box``, or else in the box of the points.
@@ -101,7 +102,9 @@ def gaussians_from_points(
         )
     count = len(points)
     scale = settings.scale * neighbor_distance(points, settings.neighbors)
-    if settings.random_rotation:
+    if settings.orientation == "pca":
+        quaternions = surface_orientations(points)
+    elif settings.random_rotation:
         quaternions = torch.rand(count, 4, generator=generator)
     else:
         quaternions = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1)
@@ -114,6 +117,24 @@ def gaussians_from_points(
         sh_rest=torch.zeros(count, rest_count(settings.sh_degree), 3),
     )
     return made.with_channels(*channels).requires_grad_()
+
+
+def surface_orientations(points: Tensor, neighbors: int = 10) -> Tensor:
+    """(P, 4) quaternions (w, x, y, z) whose third axis is the shortest principal axis of each point's neighbourhood,
+    the first the longest: where points lie on a surface, its normal. No direction along the normal is preferred.
+
+    With fewer other points than ``neighbors``, of all of them; a single point gets the identity.
+    """
+    count = min(neighbors, len(points) - 1)
+    if count < 1:
+        return torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(points), 1)
+    coordinates = points.double().numpy()
+    _, near = KDTree(coordinates).query(coordinates, k=count + 1, workers=torch.get_num_threads())
+    around = coordinates[near] - coordinates[near].mean(axis=1, keepdims=True)
+    _, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))  # columns, by ascending eigenvalue
+    normal, longest = axes[:, :, 0], axes[:, :, 2]
+    frames = np.stack((longest, np.cross(normal, longest), normal), axis=2)
+    return torch.from_numpy(Rotation.from_matrix(frames).as_quat()[:, [3, 0, 1, 2]]).float()
 
 
 def neighbor_distance(points: Tensor, neighbors: int) -> Tensor:

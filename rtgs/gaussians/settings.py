@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
+from rtgs.core.recipe import UNLESS_DEFAULT
 from rtgs.core.refuse import refuse_bad_numbers, refuse_unknown_words, refuse_unless
 
 DensityStrategy = Literal["adaptive", "mcmc"]
+Orientation = Literal["published", "pca"]
 RoughnessCurve = Literal["log", "linear"]
 
 
@@ -18,10 +21,16 @@ class InitSettings:
     opacity: float = 0.1
     scale: float = 1.0  # times the distance to the neighbours
     random_rotation: bool = True  # 2DGS and EnvGS; 3DGS starts from the identity
+    # "published": as random_rotation says; "pca": the shortest axis along that of the point's 10 neighbours. Discs that
+    # stand across their surface split into discs in empty air.
+    orientation: Orientation = field(default="published", metadata=UNLESS_DEFAULT)
     sh_degree: int = 3
     neighbors: int = 3
     min_points: int = 10  # fewer usable points than this: the capture is refused (or random points, if asked for)
     random_points: int = 0  # > 0: ignore the scene's points, draw this many in the scene box
+
+    def __post_init__(self) -> None:
+        refuse_unknown_words(self, "init")
 
 
 @dataclass(frozen=True)
@@ -45,9 +54,23 @@ class OptimizerSettings:
     opacity_logit_limit: float = 13.8  # sigmoid within 1e-6 of 0 and 1
     smallest_scale: float = 1e-6  # times the scene extent
     largest_scale: float = 100.0  # times the scene extent
+    # From this share of means_lr_steps to their end every rate but the means', which has its own decay, falls along a
+    # half cosine to decay_to of itself; 1: none does (2DGS, EnvGS).
+    decay_from: float = field(default=1.0, metadata=UNLESS_DEFAULT)
+    decay_to: float = field(default=0.1, metadata=UNLESS_DEFAULT)
 
     def __post_init__(self) -> None:
         refuse_bad_numbers(self, "method.optimizer")
+        for name in ("decay_from", "decay_to"):
+            value = getattr(self, name)
+            refuse_unless(0 <= value <= 1, f"method.optimizer.{name}", value, "between 0 and 1")
+
+    def decay(self, share: float) -> float:
+        """What the rates are multiplied with after this ``share`` of means_lr_steps."""
+        if share <= self.decay_from or self.decay_from >= 1:
+            return 1.0
+        done = min((share - self.decay_from) / (1 - self.decay_from), 1.0)
+        return self.decay_to + (1 - self.decay_to) * 0.5 * (1 + math.cos(math.pi * done))
 
     def learning_faster(self, gain: float) -> OptimizerSettings:
         """The rates of colours and scales times ``gain``; the others stay."""

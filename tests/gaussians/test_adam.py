@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from rtgs.core.errors import RtgsError
 from rtgs.gaussians.adam import GaussianAdam, NonFiniteGradientError, find_nonfinite
 from rtgs.gaussians.settings import OptimizerSettings
 from rtgs.gaussians.surfels import Surfels
@@ -264,3 +265,20 @@ def test_same_bits_for_any_thread_count(isa):
     torch.set_num_threads(before)
     for other in results[1:]:
         assert all(torch.equal(a, b) for (_, a), (_, b) in zip(results[0].items(), other.items()))
+
+
+def test_all_rates_fall_along_a_half_cosine_where_asked():
+    settings = OptimizerSettings(decay_from=0.5, decay_to=0.2)
+    gaussians = surfels_of(5)
+    adam = GaussianAdam(gaussians, settings, 2.0, means_lr_steps=1000)
+    plain = GaussianAdam(gaussians, OptimizerSettings(), 2.0, means_lr_steps=1000)
+    for step, factor in ((0, 1.0), (500, 1.0), (750, 0.6), (1000, 0.2), (5000, 0.2)):
+        rates, before = adam.learning_rates(step), plain.learning_rates(step)
+        assert rates.pop("means") == before.pop("means"), "they have a decay of their own"
+        for name, rate in rates.items():
+            assert rate == pytest.approx(factor * before[name]), name
+
+
+def test_a_decay_beyond_the_run_is_refused():
+    with pytest.raises(RtgsError, match=r"method\.optimizer\.decay_from=1\.5 must be between 0 and 1"):
+        OptimizerSettings(decay_from=1.5)

@@ -3,8 +3,15 @@
 import pytest
 import torch
 
+from rtgs.core.errors import RtgsError
 from rtgs.gaussians.activate import activate_gaussians
-from rtgs.gaussians.initialize import neighbor_distance, points_box, random_points, surfels_from_points
+from rtgs.gaussians.initialize import (
+    neighbor_distance,
+    points_box,
+    random_points,
+    surface_orientations,
+    surfels_from_points,
+)
 from rtgs.gaussians.settings import InitSettings
 
 
@@ -119,3 +126,29 @@ def test_bad_arguments():
         surfels_from_points(points, colors, InitSettings(neighbors=0), generator())
     with pytest.raises(ValueError, match="low corner first"):
         random_points(5, torch.tensor([[1.0, 0, 0], [0.0, 1, 1]]), generator())
+
+
+def test_pca_lays_discs_on_the_surface_of_the_points():
+    """A plane that no axis belongs to, with noise a hundredth of the spacing: normals within a degree or two."""
+    source = generator()
+    normal = torch.nn.functional.normalize(torch.tensor([0.3, -0.5, 0.8]), dim=0)
+    flat = torch.randn(400, 3, generator=source)
+    points = flat - (flat @ normal)[:, None] * normal + 1e-3 * torch.randn(400, 1, generator=source) * normal
+    settings = InitSettings(orientation="pca")
+    made = surfels_from_points(points, torch.rand(400, 3, generator=source), settings, generator())
+    active = activate_gaussians(made, torch.zeros(3), 0)
+    third = torch.linalg.cross(active.tangent_u, active.tangent_v)
+    assert float((third @ normal).abs().quantile(0.02)) > 0.999
+    again = surfels_from_points(points, torch.rand(400, 3), settings, torch.Generator().manual_seed(1))
+    assert torch.equal(made.quaternions, again.quaternions), "nothing is drawn"
+
+
+def test_pca_of_few_or_equal_points_stays_finite():
+    for points in (torch.zeros(12, 3), torch.tensor([[0.0, 0, 0], [1, 0, 0]]), torch.zeros(1, 3)):
+        found = surface_orientations(points)
+        torch.testing.assert_close(found.norm(dim=1), torch.ones(len(points)))
+
+
+def test_an_unknown_orientation_is_refused():
+    with pytest.raises(RtgsError, match=r"init\.orientation='pcs' is unknown: .*did you mean 'pca'"):
+        InitSettings(orientation="pcs")  # type: ignore[arg-type]
