@@ -22,7 +22,7 @@ from pipelines.steps.training import read_history, stage_params
 from rtgs.config.schema import Choices, RunConfig
 from rtgs.core.errors import RtgsError
 from rtgs.core.listing import columns
-from rtgs.evaluate.records import METRICS, EvaluationTable, read_json
+from rtgs.evaluate.records import EvaluationTable, read_json
 from rtgs.prepare.masks.report import FILES as MASK_FILES
 from rtgs.prepare.poses.quality import PICTURE_FILE, REPORT_FILE
 from rtgs.track import RunInfo, Tracker
@@ -221,7 +221,7 @@ def track_end(tracker: Tracker, folder: Path, results: Sequence[StepResult], art
                 step = int(row.pop("step"))
                 tracker.metrics(row, step)
     table = evaluation_of(results)
-    means = {name: table.mean(name) for name in METRICS}
+    means = {name: table.mean(name) for name in table.metrics}
     tracker.metrics({f"eval/{name}": value for name, value in means.items() if value is not None})
     facts = {"train_seconds": table.facts.train_seconds, "peak_memory_mb": table.facts.peak_memory_mb}
     tracker.metrics({f"cost/{name}": value for name, value in facts.items() if value is not None})

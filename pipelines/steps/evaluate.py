@@ -41,7 +41,7 @@ class EvaluateParams:
 def evaluate(params: EvaluateParams, context: StepContext) -> None:
     """Write ``metrics.json``, ``metrics.csv`` and ``errors/<stem>.png``; without test views, tables without rows."""
     from rtgs.evaluate.evaluate import NO_TEST_VIEWS, evaluate_views, write_error_maps
-    from rtgs.evaluate.records import RunFacts, write_csv, write_json
+    from rtgs.evaluate.records import GLASS_METRICS, RunFacts, write_csv, write_json
     from rtgs.scenes.canonical import read_scene
 
     scene = context.read("import_scene", read_scene)
@@ -69,7 +69,7 @@ def evaluate(params: EvaluateParams, context: StepContext) -> None:
     write_error_maps(renders, scene.test, context.out / "errors")
     rows = [{"view": row.view, **row.values} for row in table.rows]
     context.tracker.table("eval", rows)
-    means = {name: table.mean(name) for name in TRACKED}
+    means = {name: table.mean(name) for name in (*TRACKED, *GLASS_METRICS)}
     context.tracker.metrics({f"eval/{name}": value for name, value in means.items() if value is not None})
     if known is not None:
         context.log.info("guide of the object's mesh: %s", known.fallbacks)

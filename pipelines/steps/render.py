@@ -118,14 +118,15 @@ def read_timed(folder: Path, times: RenderTimes, view_name: str, camera: Camera 
     import torch
 
     from rtgs.evaluate.evaluate import TimedRender
+    from rtgs.evaluate.layers import GLASS_LAYERS
 
     tensors = read_render(folder, view_name)
     layers = (tensors.get("reflection"), tensors.get("transmission"))
     normal = tensors.get("normal")
     if normal is not None:
         normal = None if camera is None else torch.einsum("ij,jhw->ihw", camera.rotation.float(), normal)
-    surface = (tensors.get("depth"), normal)
-    return TimedRender(tensors["image"], times.of(view_name), *layers, tensors.get(GIVEN), *surface)
+    surface, glass = (tensors.get("depth"), normal), {name: tensors.get(name) for name in GLASS_LAYERS}
+    return TimedRender(tensors["image"], times.of(view_name), *layers, tensors.get(GIVEN), *surface, **glass)
 
 
 STEP = StepKind("render", 4, render)

@@ -120,9 +120,11 @@ def _views(table: EvaluationTable, context: StepContext, count: int) -> tuple[Re
 
 def _layers(maps: dict[str, Tensor]) -> dict[str, Tensor]:
     """The layers of a rendered view as the page takes them; none for methods without reflection."""
+    from rtgs.evaluate.layers import LAYERS
+
     if "reflection" not in maps:
         return {}
-    names = ("reflection", "transmission", "normal", "specular", "roughness", "f0")
+    names = (*LAYERS, "normal", "specular", "roughness", "f0")
     return {"diffuse": (1 - maps["specular"]) * maps["diffuse"]} | {name: maps[name] for name in names if name in maps}
 
 

@@ -56,7 +56,7 @@ def synthesize(params: SynthesizeParams, context: StepContext) -> None:
     )  # fmt: skip
 
 
-STEP = StepKind("synthesize", 2, synthesize)
+STEP = StepKind("synthesize", 3, synthesize)
 
 
 def synthesize_step(description: SceneDescription, file: Path, settings: CaptureSettings, variant: str | None) -> Step:

@@ -10,11 +10,10 @@ from typing import Protocol
 from torch import Tensor
 
 from rtgs.evaluate.images import ERROR_FULL_SCALE, error_map, error_scale_note, file_stem, write_png
-from rtgs.evaluate.layers import LayerTruth, layer_scales, layer_scores, why_absent
+from rtgs.evaluate.layers import GLASS_LAYERS, LayerTruth, layer_scales, layer_scores, metrics_of, why_absent
 from rtgs.evaluate.metrics import psnr, quantized, ssim
 from rtgs.evaluate.records import (
     GIVEN_MASK_METRICS,
-    LAYER_METRICS,
     METRICS,
     SURFACE_METRICS,
     EvaluationTable,
@@ -54,6 +53,9 @@ class TimedRender:
     given_masks: Tensor | None = None  # (3, H, W) the image through the view's own mask, likewise
     depth: Tensor | None = None  # (H, W) z-depth of the first surface
     normal: Tensor | None = None  # (3, H, W) of the first surface, camera frame, any length
+    inner: Tensor | None = None  # (3, H, W) part of the transmission that is mirrored inside the glass, likewise
+    contents: Tensor | None = None  # (3, H, W) part that comes straight from inside it
+    behind: Tensor | None = None  # (3, H, W) part that comes straight through it
 
 
 EVERYTHING = EvaluationSettings()
@@ -105,10 +107,12 @@ def evaluate_views(
         except (TypeError, ValueError) as error:
             raise type(error)(f"view {view.name!r}: {error}") from error
         rows.append(score)
-    absent = [name for name in LAYER_METRICS if any(row.values[name] is None for row in rows)]
+    absent = [name for name in metrics_of(renders) if any(row.values.get(name) is None for row in rows)]
     missing |= {name: why_absent(name, renders, views) for name in absent}
     _explain_absent(rows, settings, missing)
-    return EvaluationTable(facts, tuple(rows), missing, scales["reflection"], scales["transmission"], object_facts)
+    glass = {name: scale for name in GLASS_LAYERS if (scale := scales[name]) is not None}
+    whole = (scales["reflection"], scales["transmission"])
+    return EvaluationTable(facts, tuple(rows), missing, *whole, object_facts, glass)
 
 
 def _score(render: TimedRender, view: PhotoView, settings: EvaluationSettings, model: Lpips | None) -> ViewScore:

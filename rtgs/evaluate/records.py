@@ -18,6 +18,10 @@ LAYER_METRICS = (
     "psnr_diffuse_part",
     *(f"psnr_{layer}{scaled}" for layer in ("reflection", "transmission") for scaled in ("", "_scaled")),
 )
+# Of the parts of the transmitted light: in a table only where a method renders such layers.
+GLASS_METRICS = tuple(
+    f"psnr_{layer}{scaled}" for layer in ("inner", "contents", "behind") for scaled in ("", "_scaled")
+)
 SURFACE_METRICS = ("depth_error_masked", "depth_share_masked", "normal_degrees_masked", "normal_share_masked")
 # Seen through the test views' own masks instead of the mesh's silhouette (method.md 7; decision 21).
 GIVEN_MASK_METRICS = ("psnr_given_masks", "psnr_masked_given_masks", "ssim_masked_given_masks")
@@ -97,7 +101,7 @@ class ViewScore:
     width: int
     height: int
     mask_share: float | None  # share of the pixels inside the mask; None without a mask
-    values: dict[str, float | None]  # keys: METRICS
+    values: dict[str, float | None]  # keys: METRICS, of methods that render such layers also GLASS_METRICS
 
 
 @dataclass(frozen=True)
@@ -110,6 +114,12 @@ class EvaluationTable:
     reflection_scale: float | None = None  # of psnr_reflection_scaled
     transmission_scale: float | None = None  # of psnr_transmission_scaled
     object: ObjectFacts | None = None  # of methods with a third stage, on scenes that have one
+    glass_scales: dict[str, float] = field(default_factory=dict)  # by layer: of GLASS_METRICS that are scaled
+
+    @property
+    def metrics(self) -> tuple[str, ...]:
+        """The columns: METRICS, and GLASS_METRICS where the rows have them."""
+        return METRICS + tuple(name for name in GLASS_METRICS if any(name in row.values for row in self.rows))
 
     def mean(self, metric: str) -> float | None:
         """Mean over the views that have the metric; None when none has."""
@@ -135,9 +145,10 @@ class EvaluationTable:
         return " to ".join(f"{width}x{height}" for width, height in dict.fromkeys(sizes[:1] + sizes[-1:]))
 
     def _present(self, metric: str) -> list[float]:
-        if metric not in METRICS:
-            raise KeyError(f"no metric {metric!r}; there are {', '.join(METRICS)}")
-        return [value for row in self.rows if (value := row.values[metric]) is not None]
+        if metric not in (*METRICS, *GLASS_METRICS):
+            raise KeyError(f"no metric {metric!r}; there are {', '.join((*METRICS, *GLASS_METRICS))}")
+        values = (row.values.get(metric) if metric in GLASS_METRICS else row.values[metric] for row in self.rows)
+        return [value for value in values if value is not None]
 
 
 def write_json(path: Path, table: EvaluationTable) -> None:
@@ -147,12 +158,13 @@ def write_json(path: Path, table: EvaluationTable) -> None:
         "version": VERSION,
         "facts": asdict(table.facts),
         "resolution": table.resolution,
-        "mean": {name: table.mean(name) for name in METRICS},
-        "std": {name: table.std(name) for name in METRICS},
-        "count": {name: table.count(name) for name in METRICS},
+        "mean": {name: table.mean(name) for name in table.metrics},
+        "std": {name: table.std(name) for name in table.metrics},
+        "count": {name: table.count(name) for name in table.metrics},
         "missing": table.missing,
         "reflection_scale": table.reflection_scale,
         "transmission_scale": table.transmission_scale,
+        **({"glass_scales": table.glass_scales} if table.glass_scales else {}),
         "object": None if table.object is None else asdict(table.object),
         "views": [asdict(row) for row in table.rows],
     }
@@ -178,7 +190,7 @@ def read_json(path: Path) -> EvaluationTable:
 def write_csv(path: Path, table: EvaluationTable) -> None:
     """One line per view, then mean and std; an absent figure is an empty field."""
     facts = asdict(table.facts)
-    header = ["scene", "method", "preset", "view", "resolution", "mask_share", *METRICS]
+    header = ["scene", "method", "preset", "view", "resolution", "mask_share", *table.metrics]
     header += ["steps", "surfels", "train_seconds", "train_cpu_seconds", "peak_memory_mb"]
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="", encoding="utf-8") as stream:
@@ -188,5 +200,5 @@ def write_csv(path: Path, table: EvaluationTable) -> None:
             cells = {"view": row.view, "resolution": f"{row.width}x{row.height}", "mask_share": row.mask_share}
             writer.writerow({**facts, **row.values, **cells})
         for label, statistic in (("mean", table.mean), ("std", table.std)):
-            cells = {name: statistic(name) for name in METRICS}
+            cells = {name: statistic(name) for name in table.metrics}
             writer.writerow({**facts, **cells, "view": label, "resolution": table.resolution})

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from rtgs.core.cameras import Camera
 from rtgs.evaluate.images import to_bytes
-from rtgs.evaluate.layers import encoded
+from rtgs.evaluate.layers import GLASS_LAYERS, LAYERS, encoded
 from rtgs.report.figures import alpha_picture, normal_picture
 from rtgs.scenes.truth import ViewTruth
 
@@ -33,15 +33,16 @@ def layer_pixels(
 
     Args:
         layers: by name, all sRGB where they are colours: ``diffuse`` (3, H, W) the image without its reflection,
-            ``reflection`` (3, H, W) k_s w_r C_r, ``transmission`` (3, H, W), ``normal`` (3, H, W) world frame,
-            ``specular`` (H, W) k_s, ``roughness`` (H, W) and ``f0`` (H, W) or (3, H, W). Absent ones are left out.
+            ``reflection`` (3, H, W) k_s w_r C_r, ``transmission`` (3, H, W) and its parts ``inner``, ``contents`` and
+            ``behind``, ``normal`` (3, H, W) world frame, ``specular`` (H, W) k_s, ``roughness`` (H, W) and ``f0``
+            (H, W) or (3, H, W). Absent ones are left out.
         image: (3, H, W) the render.
         photo: (3, H, W).
     """
     if not layers:
         return []
     true = _truth_pixels(truth, camera)
-    shown = {name: to_bytes(layers[name]) for name in ("diffuse", "reflection", "transmission") if name in layers}
+    shown = {name: to_bytes(layers[name]) for name in ("diffuse", *LAYERS) if name in layers}
     if "normal" in layers:
         shown["normal"] = normal_picture(layers["normal"], camera)
     for name in ("specular", "roughness", "f0"):
@@ -61,6 +62,9 @@ _TITLES = {
     "diffuse": ("Diffuse", "what the base set adds to the image, (1 − k_s) C_d; truth: diffuse light, sRGB encoded"),
     "reflection": ("Reflection", "k_s w_r C_r; truth: specularly reflected light, sRGB encoded"),
     "transmission": ("Transmission", "k_s w_t C_t; truth: light through the first surface, sRGB encoded"),
+    "inner": ("Inner", "part of the transmission: mirrored inside the glass"),
+    "contents": ("Contents", "part of the transmission: straight from what is inside the glass"),
+    "behind": ("Behind", "part of the transmission: straight through the glass"),
     "normal": ("Normal", "camera frame: red right, green up, blue towards the viewer"),
     "specular": ("Specular k_s", "0 black, 1 white; truth: specular objects"),
     "roughness": ("Roughness", "0 black, 1 white"),
@@ -80,4 +84,5 @@ def _truth_pixels(truth: ViewTruth | None, camera: Camera) -> dict[str, np.ndarr
     }
     if bool((truth.transmitted > 0).any()):
         pixels["transmission"] = to_bytes(encoded(truth.transmitted))
-    return pixels
+    parts = {name: light for name in GLASS_LAYERS if (light := getattr(truth, name)) is not None}
+    return pixels | {name: to_bytes(encoded(light)) for name, light in parts.items()}

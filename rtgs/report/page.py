@@ -15,7 +15,7 @@ from torch import Tensor
 from rtgs.core.cameras import Camera
 from rtgs.core.decisions import Decision
 from rtgs.evaluate.images import ERROR_COLORMAP, ERROR_FULL_SCALE, error_map, to_bytes
-from rtgs.evaluate.records import EvaluationTable, ViewScore
+from rtgs.evaluate.records import GLASS_METRICS, EvaluationTable, ViewScore
 from rtgs.report.figures import (
     DEPTH_COLORMAP,
     Curve,
@@ -233,6 +233,7 @@ _WHEN_PRESENT = (
     Column("psnr_reflection_scaled", "PSNR of the reflection, scaled", 2),
     Column("psnr_transmission", "PSNR of the transmission", 2),
     Column("psnr_transmission_scaled", "PSNR of the transmission, scaled", 2),
+    *(Column(name, f"PSNR of {name.removeprefix('psnr_').replace('_', ', ')}", 2) for name in GLASS_METRICS),
     Column("psnr_given_masks", "PSNR, given masks", 2),
     Column("psnr_masked_given_masks", "PSNR in mask, given masks", 2),
     Column("ssim_masked_given_masks", "SSIM in mask, given masks", 4),
@@ -253,7 +254,7 @@ def _columns(table: EvaluationTable) -> tuple[Column, ...]:
 
 def _reasons(table: EvaluationTable) -> list[tuple[str, str]]:
     """(columns, reason), columns with the same reason together."""
-    titles = {column.metric: column.title for column in _ALWAYS + _WHEN_PRESENT}
+    titles = {column.metric: column.title for column in _ALWAYS + _WHEN_PRESENT if column.metric in table.metrics}
     every_lpips = {metric for metric in titles if metric.startswith("lpips")}
     grouped: dict[str, set[str]] = {}
     for metric, reason in table.missing.items():

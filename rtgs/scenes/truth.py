@@ -9,10 +9,12 @@
 | ``objects.png`` | 8-bit grey: shape id + 1, 0 = nothing | exact |
 | ``specular.png`` | 1 bit: mirror, glossy or glass | exact |
 | ``diffuse.png``, ``reflected.png``, ``transmitted.png`` | 8-bit sRGB curve of light / ``scale`` (text chunk, a power of two) | half a step of 8 bits; the brightest 0.1 % of a layer may be clipped at ``scale`` |
+| ``inner.png``, ``contents.png``, ``behind.png`` | likewise, nothing clipped: together ``transmitted``; all three, or none in captures that do not tell them apart | half a step of 8 bits |
 """  # noqa: E501
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -23,7 +25,7 @@ from torch import Tensor
 
 from rtgs.scenes.images import nearest_resize
 from rtgs.scenes.settings import CaptureError
-from rtgs.scenes.truth_files import truth_files
+from rtgs.scenes.truth_files import GLASS_MAPS, truth_files
 
 LAYERS = ("diffuse", "reflected", "transmitted")
 _DEPTHS = ("depth", "second_depth")
@@ -45,6 +47,10 @@ class ViewTruth:
     diffuse: Tensor  # (3, H, W) float32 linear light x exposure: neither of the two below
     reflected: Tensor  # (3, H, W) float32 linear light x exposure: reflected specularly by the first surface
     transmitted: Tensor  # (3, H, W) float32 linear light x exposure: come through the first surface
+    # Parts of the transmitted light, (3, H, W) float32 each, all three or none: the capture does not tell them apart.
+    inner: Tensor | None = None  # mirrored at glass after the first surface: off the inside of the far wall
+    contents: Tensor | None = None  # straight from what is inside the glass
+    behind: Tensor | None = None  # straight through the glass
 
     @property
     def image(self) -> Tensor:
@@ -53,16 +59,18 @@ class ViewTruth:
         return torch.from_numpy(srgb_from_linear(total.numpy())).float()
 
     def tensors(self) -> dict[str, Tensor]:
-        """Every field by its name."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+        """Every field by its name, but the unknown ones."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: value for name, value in values.items() if value is not None}
 
     def resized(self, width: int, height: int) -> ViewTruth:
         """Shrunk like its photo: light is averaged over area, geometry is taken at the new pixels' centres (an average
         over an edge would be a depth where nothing is)."""
         if self.depth.shape == (height, width):
             return self
-        nearest = {name: _nearest(value, width, height) for name, value in self.tensors().items() if name not in LAYERS}
-        return ViewTruth(**nearest, **{name: _averaged(getattr(self, name), width, height) for name in LAYERS})
+        light = {name: value for name, value in self.tensors().items() if name in (*LAYERS, *GLASS_MAPS)}
+        nearest = {name: _nearest(value, width, height) for name, value in self.tensors().items() if name not in light}
+        return ViewTruth(**nearest, **{name: _averaged(value, width, height) for name, value in light.items()})
 
 
 def _nearest(values: Tensor, width: int, height: int) -> Tensor:
@@ -94,7 +102,7 @@ def write_truth(folder: Path, truth: ViewTruth) -> None:
     """Write the pictures of one view into ``folder`` (made if missing).
 
     Raises:
-        ValueError: more than 254 shapes, which 8 bits cannot tell apart.
+        ValueError: more than 254 shapes, which 8 bits cannot tell apart; some parts of the transmitted light, not all.
     """
     folder.mkdir(parents=True, exist_ok=True)
     for name in _DEPTHS:
@@ -111,10 +119,30 @@ def write_truth(folder: Path, truth: ViewTruth) -> None:
     _save(folder / "objects.png", (objects + 1).astype(np.uint8))
     _save(folder / "specular.png", truth.specular.numpy())
     for name in LAYERS:
-        light = getattr(truth, name).numpy().transpose(1, 2, 0)
-        brightest = float(np.quantile(light.max(-1), 1 - _CLIPPED_SHARE))
-        scale = float(np.clip(2.0 ** np.ceil(np.log2(max(brightest, 1e-6))), 1.0, _LARGEST_SCALE))
-        _save(folder / f"{name}.png", np.rint(srgb_from_linear(light / scale) * 255).astype(np.uint8), scale)
+        _save_light(folder / f"{name}.png", getattr(truth, name), _CLIPPED_SHARE)
+    parts = {name: part for name in GLASS_MAPS if (part := getattr(truth, name)) is not None}
+    if parts:
+        write_glass(folder, parts)
+
+
+def write_glass(folder: Path, parts: Mapping[str, Tensor]) -> None:
+    """Write the parts of the transmitted light, (3, H, W) each by its name, beside the pictures of their view.
+
+    Raises:
+        ValueError: not all of the parts.
+    """
+    if set(parts) != set(GLASS_MAPS):
+        raise ValueError(f"truth {folder} would hold {', '.join(parts)} only: write all of {', '.join(GLASS_MAPS)}")
+    for name in GLASS_MAPS:
+        _save_light(folder / f"{name}.png", parts[name], 0.0)
+
+
+def _save_light(path: Path, light: Tensor, clipped_share: float) -> None:
+    """``clipped_share``: of the pixels, those that may be brighter than the scale."""
+    pixels = light.numpy().transpose(1, 2, 0)
+    brightest = float(np.quantile(pixels.max(-1), 1 - clipped_share))
+    scale = float(np.clip(2.0 ** np.ceil(np.log2(max(brightest, 1e-6))), 1.0, _LARGEST_SCALE))
+    _save(path, np.rint(srgb_from_linear(pixels / scale) * 255).astype(np.uint8), scale)
 
 
 def _save(path: Path, pixels: np.ndarray, scale: float | None = None) -> None:
@@ -138,9 +166,8 @@ def read_truth(folder: Path) -> ViewTruth:
     for name, (pixels, scale) in loaded.items():
         if name in _DEPTHS:
             values[name] = (pixels.astype(np.float64) * _scale(folder / f"{name}.png", scale)).astype(np.float32)
-        elif name in LAYERS:
-            light = linear_from_srgb(pixels / 255.0) * _scale(folder / f"{name}.png", scale)
-            values[name] = light.astype(np.float32).transpose(2, 0, 1)
+        elif name in (*LAYERS, *GLASS_MAPS):
+            values[name] = _light(folder / f"{name}.png", pixels, scale)
     known = loaded["objects"][0] > 0
     normal = loaded["normal"][0] / np.float32(127.5) - 1
     normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6) * known[..., None]
@@ -148,6 +175,22 @@ def read_truth(folder: Path) -> ViewTruth:
     values["objects"] = loaded["objects"][0].astype(np.int16) - np.int16(1)
     values["specular"] = loaded["specular"][0].astype(bool)
     return ViewTruth(**{name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in values.items()})
+
+
+def read_light(folder: Path, name: str) -> Tensor:
+    """(3, H, W) one layer of light by itself.
+
+    Raises:
+        CaptureError: its file is missing or damaged, or lacks its scale.
+    """
+    path = folder / f"{name}.png"
+    return torch.from_numpy(np.ascontiguousarray(_light(path, *_load(path))))
+
+
+def _light(path: Path, pixels: np.ndarray, scale: str | None) -> np.ndarray:
+    if pixels.shape[2:] != (3,):
+        raise CaptureError(f"truth {path} is no colour picture: make the capture again")
+    return (linear_from_srgb(pixels / 255.0) * _scale(path, scale)).astype(np.float32).transpose(2, 0, 1)
 
 
 def _load(path: Path) -> tuple[np.ndarray, str | None]:

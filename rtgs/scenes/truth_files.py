@@ -6,12 +6,21 @@ from pathlib import Path
 
 TRUTH_FOLDER = "truth"
 TRUTH_MAPS = ("depth", "second_depth", "normal", "objects", "specular", "diffuse", "reflected", "transmitted")
-"""The fields of :class:`rtgs.scenes.truth.ViewTruth`, one PNG each."""
+"""The fields of :class:`rtgs.scenes.truth.ViewTruth` that every view has, one PNG each."""
+GLASS_MAPS = ("inner", "contents", "behind")
+"""Its other fields: the parts of ``transmitted``. Captures made before they were told apart have none of the three."""
 
 
 def truth_files(folder: Path) -> tuple[Path, ...]:
-    """The files :func:`rtgs.scenes.truth.read_truth` reads."""
-    return tuple(folder / f"{name}.png" for name in TRUTH_MAPS)
+    """The files :func:`rtgs.scenes.truth.read_truth` reads; with one part of the transmitted light, all of them."""
+    parts = glass_files(folder)
+    maps = tuple(folder / f"{name}.png" for name in TRUTH_MAPS)
+    return maps + parts if any(part.exists() for part in parts) else maps
+
+
+def glass_files(folder: Path) -> tuple[Path, ...]:
+    """Where the parts of the transmitted light lie, whether they are there or not."""
+    return tuple(folder / f"{name}.png" for name in GLASS_MAPS)
 
 
 def existing_truth(root: Path, image_name: str) -> Path | None:

@@ -12,7 +12,7 @@ from torch import Tensor
 from rtgs.evaluate.evaluate import TimedRender, evaluate_views
 from rtgs.evaluate.layers import encoded, layer_scales, layer_scores
 from rtgs.evaluate.metrics import psnr
-from rtgs.evaluate.records import LAYER_METRICS, RunFacts, read_json, write_json
+from rtgs.evaluate.records import GLASS_METRICS, LAYER_METRICS, METRICS, RunFacts, read_json, write_csv, write_json
 from rtgs.evaluate.settings import EvaluationSettings
 
 QUICK = EvaluationSettings(lpips=False, masked=False, eight_bit=False)
@@ -26,6 +26,9 @@ class Truth:
     transmitted: Tensor
     depth: Tensor
     normal: Tensor
+    inner: Tensor | None = None
+    contents: Tensor | None = None
+    behind: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -112,6 +115,61 @@ def test_the_transmitted_layer_is_measured_like_the_reflected_one():
     assert table.mean("psnr_transmission_scaled") == 100
     assert table.mean("psnr_transmission") is not None
     assert "renders no reflected layer" in table.missing["psnr_reflection"]
+
+
+def told_apart(view: Photo) -> Photo:
+    """The same view, its transmitted light in three parts."""
+    assert view.truth is not None
+    parts = [share * view.truth.transmitted for share in (0.2, 0.3, 0.5)]
+    return replace(view, truth=replace(view.truth, inner=parts[0], contents=parts[1], behind=parts[2]))
+
+
+def test_parts_of_the_transmitted_light_are_measured_where_a_method_renders_them(tmp_path: Path):
+    views = [told_apart(photo(1)), told_apart(photo(2))]
+    inner = [encoded(view.truth.inner) / 2 for view in views if view.truth]  # type: ignore[arg-type]
+    behind = [random(3, 10, 12, seed=seed) for seed in (5, 6)]
+    renders = [TimedRender(v.image, inner=i, behind=b) for v, i, b in zip(views, inner, behind)]
+    table = evaluate_views(renders, views, FACTS, QUICK)
+    shown = tuple(name for name in GLASS_METRICS if "contents" not in name)
+    assert table.metrics == METRICS + shown
+    assert table.glass_scales.keys() == {"inner", "behind"}
+    assert table.glass_scales["inner"] == pytest.approx(2, rel=1e-6)
+    assert table.mean("psnr_inner_scaled") == 100
+    assert views[0].truth is not None
+    expected = psnr(behind[0], encoded(views[0].truth.behind), mask=views[0].truth.specular)  # type: ignore[arg-type]
+    assert table.rows[0].values["psnr_behind"] == expected
+    assert table.mean("psnr_contents") is None
+    assert not set(GLASS_METRICS) & set(table.missing)
+    write_json(tmp_path / "metrics.json", table)
+    assert read_json(tmp_path / "metrics.json") == table
+    write_csv(tmp_path / "metrics.csv", table)
+    assert ",psnr_behind,psnr_behind_scaled," in (tmp_path / "metrics.csv").read_text().splitlines()[0]
+
+
+def test_nothing_is_said_of_parts_that_a_method_does_not_render(tmp_path: Path):
+    """Nor does any figure or file change where the truth tells them apart."""
+    renders = [TimedRender(random(3, 10, 12, seed=4), None, random(3, 10, 12, seed=9), random(3, 10, 12, seed=8))]
+    files = []
+    for view in (photo(1), told_apart(photo(1))):
+        table = evaluate_views(renders, [view], FACTS, QUICK)
+        assert table.metrics == METRICS
+        assert not set(GLASS_METRICS) & (set(table.missing) | set(table.rows[0].values))
+        write_json(tmp_path / "metrics.json", table)
+        write_csv(tmp_path / "metrics.csv", table)
+        files.append((tmp_path / "metrics.json").read_bytes() + (tmp_path / "metrics.csv").read_bytes())
+    assert files[0] == files[1]
+    assert b"inner" not in files[0]
+    assert b"glass_scales" not in files[0]
+
+
+def test_parts_without_a_truth_have_a_reason():
+    parts = [TimedRender(random(3, 10, 12), contents=random(3, 10, 12, seed=3)) for _ in range(2)]
+    table = evaluate_views(parts, [photo(1), photo(2)], FACTS, QUICK)
+    assert "does not tell apart the light that comes through glass" in table.missing["psnr_contents"]
+    assert table.mean("psnr_contents") is None
+    mixed = evaluate_views([parts[0], TimedRender(random(3, 10, 12))], [told_apart(photo(1)), photo(2)], FACTS, QUICK)
+    assert "renders no contents layer" in mixed.missing["psnr_contents"]
+    assert mixed.count("psnr_contents") == 1
 
 
 def test_an_image_through_given_masks_has_columns_of_its_own():

@@ -1,5 +1,7 @@
 """Layers beside their truth in the report."""
 
+from dataclasses import replace
+
 import torch
 
 from rtgs.core.cameras import Camera
@@ -68,3 +70,21 @@ def test_without_layers_there_are_none_and_without_truth_one_row():
     assert layer_pixels({}, photo, photo, camera(), truth()) == []
     found = layer_pixels(layers(), photo, photo, camera(), None)
     assert all(item.truth is None for item in found[:-1])
+
+
+def test_parts_of_the_light_through_glass_are_shown_where_a_method_renders_them():
+    photo = torch.rand(3, *SIZE)
+    whole = truth(1.0)
+    parts = replace(whole, inner=whole.transmitted / 4, contents=whole.transmitted / 4, behind=whole.transmitted / 2)
+    rendered = layers() | {"inner": torch.full((3, *SIZE), 0.5), "behind": torch.full((3, *SIZE), 0.25)}
+    found = {item.title: item for item in layer_pixels(rendered, photo, photo, camera(), parts)}
+    assert list(found)[:5] == ["Diffuse", "Reflection", "Transmission", "Inner", "Behind"]
+    inner = found["Inner"]
+    assert inner.rendered is not None
+    assert inner.truth is not None
+    assert int(inner.rendered[0, 0, 0]) == 128
+    assert 60 < int(inner.truth[0, 0, 0]) < 70  # sRGB of 0.2140 / 4
+    unknown = {item.title: item for item in layer_pixels(rendered, photo, photo, camera(), whole)}
+    assert unknown["Inner"].truth is None
+    silent = [item.title for item in layer_pixels(layers(), photo, photo, camera(), parts)]
+    assert silent == [item.title for item in layer_pixels(layers(), photo, photo, camera(), whole)]

@@ -24,6 +24,7 @@ from rtgs.scenes.synthetic.assemble import SPECULAR, TRANSPARENT
 from rtgs.scenes.synthetic.colmap_text import write_colmap_text
 from rtgs.scenes.synthetic.description import SceneDescription
 from rtgs.scenes.synthetic.features import PictureView, feature_points
+from rtgs.scenes.synthetic.glass_truth import add_glass_truth, glass_samples
 from rtgs.scenes.synthetic.layers import LightLayers
 from rtgs.scenes.synthetic.lightmap import LightmapSettings
 from rtgs.scenes.synthetic.monocular import perturbed_normals, shrunk_normals
@@ -117,6 +118,8 @@ def _write_view(tracer: PathTracer, camera: Camera, index: int, settings: Captur
     Image.fromarray((levels * (254 // _NORMAL_LEVELS)).astype(np.uint8)).save(folder / "normal.png", optimize=True)
     if settings.has_truth(index):
         write_truth(folder / "truth", _truth(layers, geometry, specular))
+        if _has_glass(tracer.description):
+            add_glass_truth(tracer, camera, folder / "truth", glass_samples(settings.view_samples(index)))
     ViewRecord(
         image=f"{camera.name}.{_suffix(settings, index)}",
         samples=settings.view_samples(index),

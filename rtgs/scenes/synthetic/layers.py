@@ -60,11 +60,11 @@ class FirstSurface:
         si = self.scene.ray_intersect(ray)
         bsdf = si.bsdf(ray) if not self.scalar or si.is_valid() else None
         if bsdf is None:
-            return self._radiance(ray, sampler, True), zero, zero
+            return self.radiance(ray, sampler, True), zero, zero
         flags = bsdf.flags()
         specular = si.is_valid() & ((flags & self.reflecting) != 0)
         passing = (flags & self.passing) != 0
-        plain = self._radiance(ray, sampler, specular == False)  # noqa: E712 - scalar bool or vector mask
+        plain = self.radiance(ray, sampler, specular == False)  # noqa: E712 - scalar bool or vector mask
         reflected = self._component(si, bsdf, self.reflecting, sampler, specular)
         other = self._component(si, bsdf, self.rest, sampler, specular)
         emitted = self._emission(si, specular)
@@ -89,7 +89,7 @@ class FirstSurface:
         chance = self._emitter_density(si, after, active)
         delta = (drawn.sampled_type & mi.BSDFFlags.Delta.value) != 0
         share = dr.select(delta, 0.0, _power(chance, drawn.pdf))
-        total = self._radiance(ray, sampler, active)  # counts the emission at ``after`` in full
+        total = self.radiance(ray, sampler, active)  # counts the emission at ``after`` in full
         return direct + dr.select(active, weight * (total - emitted * share), 0.0)
 
     def _emitter_sampled(self, si: Any, bsdf: Any, context: Any, sampler: Any, active: Any) -> Any:
@@ -118,7 +118,7 @@ class FirstSurface:
         emitter = si.emitter(self.scene)
         return self.mi.Color3f(0.0) if emitter is None else emitter.eval(si, active)
 
-    def _radiance(self, ray: Any, sampler: Any, active: Any) -> Any:
+    def radiance(self, ray: Any, sampler: Any, active: Any) -> Any:
         if active is False:
             return self.mi.Color3f(0.0)
         return self.integrator.sample(self.scene, sampler, ray, None, active)[0]

@@ -153,7 +153,7 @@ class LitSurfaces(FirstSurface):
         # a rough lobe seen edge-on may give 0 / 0; Mitsuba's own films leave such samples out, too
         return tuple(self.dr.select(self.dr.isfinite(layer), layer, 0) for layer in layers)
 
-    def _radiance(self, ray: Any, sampler: Any, active: Any) -> Any:
+    def radiance(self, ray: Any, sampler: Any, active: Any) -> Any:
         return self._split(ray, sampler, active, SPLITS)
 
     def _has(self, si: Any, bsdf: Any, types: int) -> Any:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import zlib
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from rtgs.core.cameras import Camera
 from rtgs.scenes.synthetic.assemble import scene_of
 from rtgs.scenes.synthetic.description import SceneDescription
 from rtgs.scenes.synthetic.geometry import Mesh, build
+from rtgs.scenes.synthetic.glass import GlassLight, ThroughGlass, glass_bounds
 from rtgs.scenes.synthetic.layers import FirstSurface, LightLayers
 from rtgs.scenes.synthetic.lightmap import ATTRIBUTE, LightmapSettings, LitSurfaces, bake
 from rtgs.scenes.synthetic.variants import load_mitsuba
@@ -31,6 +32,10 @@ class Geometry:
     second_depth: NDArray[np.float32]  # (H, W) z-depth of the next surface on the same straight ray, 0 where none
     normal: NDArray[np.float32]  # (H, W, 3) unit, camera frame (x right, y down, z forward), facing the camera
     shape: NDArray[np.int32]  # (H, W) index into the description's shapes, -1 where nothing
+
+
+class _Split(Protocol):
+    def layers(self, ray: Any, sampler: Any) -> tuple[Any, Any, Any]: ...
 
 
 class PathTracer:
@@ -65,18 +70,24 @@ class PathTracer:
             samples: paths a pixel and layer; rounded up to what splits into a grid of strata.
             stream: another number gives independent noise.
         """
+        return LightLayers(*self._traced(self._first_surface, camera, samples, (self.seed, camera.name, stream)))
+
+    def glass_light(self, camera: Camera, samples: int, stream: int = 0) -> GlassLight:
+        """The light through the first surface in its parts; arguments as of :meth:`layers`, noise of its own."""
+        seed = (self.seed, camera.name, stream, "glass")
+        return GlassLight(*self._traced(self._through_glass, camera, samples, seed))
+
+    def _traced(self, split: _Split, camera: Camera, samples: int, seed: tuple[object, ...]) -> NDArray[np.float32]:
+        """(3, H, W, 3): the three colours of ``split`` for every pixel, times exposure."""
         mi = self._current()
         samples = _sampler(mi, samples).sample_count()
-        seed = (self.seed, camera.name, stream)
-        if "scalar" in self.variant:
-            total = self._layers_scalar(mi, camera, samples, seed)
-        else:
-            total = self._layers_vectorised(mi, camera, samples, seed)
-        scale = self.description.exposure / samples
-        diffuse, reflected, transmitted = (total * scale).astype(np.float32).reshape(3, camera.height, camera.width, 3)
-        return LightLayers(diffuse, reflected, transmitted)
+        traced = self._traced_scalar if "scalar" in self.variant else self._traced_vectorised
+        total = traced(mi, split, camera, samples, seed) * (self.description.exposure / samples)
+        return total.astype(np.float32).reshape(3, camera.height, camera.width, 3)
 
-    def _layers_vectorised(self, mi: Any, camera: Camera, samples: int, seed: tuple[object, ...]) -> NDArray:
+    def _traced_vectorised(
+        self, mi: Any, split: _Split, camera: Camera, samples: int, seed: tuple[object, ...]
+    ) -> NDArray:
         import drjit as dr
 
         pixels = camera.width * camera.height
@@ -88,7 +99,7 @@ class PathTracer:
             sampler.seed(_seed_number(*seed, first), count * samples)
             pixel = dr.opaque(mi.UInt32, first) + dr.arange(mi.UInt32, count * samples) // samples
             place = mi.Point2f(mi.Float(pixel % camera.width), mi.Float(pixel // camera.width)) + sampler.next_2d()
-            layers = self._first_surface.layers(_rays(mi, camera, place), sampler)
+            layers = split.layers(_rays(mi, camera, place), sampler)
             # A grazing sample in millions divides zero by zero; it counts as dark instead of blackening its pixel.
             layers = [dr.select(dr.isfinite(color), color, 0.0) for color in layers]
             dr.eval(layers)  # one kernel for the nine channels
@@ -97,14 +108,14 @@ class PathTracer:
                 total[index, first : first + count] = np.stack(sums, -1)
         return total
 
-    def _layers_scalar(self, mi: Any, camera: Camera, samples: int, seed: tuple[object, ...]) -> NDArray:
+    def _traced_scalar(self, mi: Any, split: _Split, camera: Camera, samples: int, seed: tuple[object, ...]) -> NDArray:
         sampler = _sampler(mi, samples)
         total = np.zeros((3, camera.height, camera.width, 3))
         for row, column in np.ndindex(camera.height, camera.width):
             sampler.seed(_seed_number(*seed, row, column))
             for _ in range(samples):
                 place = mi.Point2f(column, row) + sampler.next_2d()
-                for index, color in enumerate(self._first_surface.layers(_rays(mi, camera, place), sampler)):
+                for index, color in enumerate(split.layers(_rays(mi, camera, place), sampler)):
                     total[index, row, column] += np.nan_to_num(np.array(color), posinf=0.0)
                 sampler.advance()
         return total
@@ -148,11 +159,7 @@ class PathTracer:
 
     @cached_property
     def _first_surface(self) -> FirstSurface:
-        # volpath's shadow rays pass thin glass, so that lamps light what stands in a glass: a quarter of the noise
-        # there at equal samples. Where there is none, path does the same in two thirds of the time.
-        thin = any(shape.material.kind == "thin_glass" for shape in self.description.shapes)
-        kind = {"type": "volpath" if thin else "path"}
-        integrator = self._mi.load_dict(kind | {"max_depth": MAX_DEPTH, "rr_depth": RUSSIAN_ROULETTE_DEPTH})
+        integrator = self._integrator(MAX_DEPTH, RUSSIAN_ROULETTE_DEPTH)
         if self.lightmap is None:
             return FirstSurface(self._mi, self._scene, integrator)
         meshes = list(self.meshes.values())
@@ -160,6 +167,22 @@ class PathTracer:
         for shape, values in zip(self._scene.shapes(), light):
             shape.add_attribute(ATTRIBUTE, 3, values.astype(np.float32).ravel())
         return LitSurfaces(self._mi, self._scene)
+
+    @cached_property
+    def _through_glass(self) -> ThroughGlass:
+        # Passing a thin wall is no bounce, a reflection is one. Passing into or out of solid glass is one, too, but is
+        # not counted here: paths in it may be longer by one or two, at the dim end of the series.
+        first = after = self._first_surface
+        if self.lightmap is None:
+            after = FirstSurface(self._mi, self._scene, self._integrator(MAX_DEPTH - 1, RUSSIAN_ROULETTE_DEPTH - 1))
+        return ThroughGlass(first, after, glass_bounds(self.description, self.meshes))
+
+    def _integrator(self, max_depth: int, rr_depth: int) -> Any:
+        # volpath's shadow rays pass thin glass, so that lamps light what stands in a glass: a quarter of the noise
+        # there at equal samples. Where there is none, path does the same in two thirds of the time.
+        thin = any(shape.material.kind == "thin_glass" for shape in self.description.shapes)
+        kind = {"type": "volpath" if thin else "path"}
+        return self._mi.load_dict(kind | {"max_depth": max_depth, "rr_depth": rr_depth})
 
 
 def _sampler(mi: Any, samples: int) -> Any:

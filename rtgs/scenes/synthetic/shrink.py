@@ -11,19 +11,21 @@ def shrink_pictures(folder: Path) -> int:
     PNG: better filters and compression (oxipng), text chunks stay. JPEG: progressive, optimised Huffman tables
     (mozjpeg), the coefficients stay.
     """
+    return sum(shrink_picture(path) for path in sorted(folder.rglob("*")))
+
+
+def shrink_picture(path: Path) -> int:
+    """The same for one file; one of another kind stays as it is."""
     import mozjpeg_lossless_optimization
 
-    saved = 0
-    for path in sorted(folder.rglob("*")):
-        if path.suffix not in (".png", ".jpg"):
-            continue
-        before = path.read_bytes()
-        png = path.suffix == ".png"
-        after = _smaller_png(before) if png else mozjpeg_lossless_optimization.optimize(before)
-        if len(after) < len(before):
-            path.write_bytes(after)
-            saved += len(before) - len(after)
-    return saved
+    if path.suffix not in (".png", ".jpg"):
+        return 0
+    before = path.read_bytes()
+    after = _smaller_png(before) if path.suffix == ".png" else mozjpeg_lossless_optimization.optimize(before)
+    if len(after) >= len(before):
+        return 0
+    path.write_bytes(after)
+    return len(before) - len(after)
 
 
 def _smaller_png(data: bytes) -> bytes:

@@ -22,6 +22,7 @@ from rtgs.scenes.settings import SceneSettings
 from rtgs.scenes.synthetic import capture as captures
 from rtgs.scenes.synthetic import variants
 from rtgs.scenes.synthetic.record import CaptureRecord
+from rtgs.scenes.truth_files import GLASS_MAPS, TRUTH_MAPS
 from rtgs.workflow import Store
 
 SCENE = """
@@ -188,7 +189,7 @@ def test_a_copy_that_meets_a_full_disk_leaves_what_was_there(scene, tmp_path, mo
     assert (tmp_path / "out" / "tiny" / "images" / "view_000.png").read_bytes() == before
     monkeypatch.setattr(shutil, "copyfile", copyfile)
     assert main(words) == 0
-    assert len(list((tmp_path / "out" / "tiny" / "truth" / "view_008").iterdir())) == 8
+    assert len(list((tmp_path / "out" / "tiny" / "truth" / "view_008").iterdir())) == len(TRUTH_MAPS + GLASS_MAPS)
     assert not (tmp_path / "out" / "tiny" / "manifest.json").exists()
 
 
