@@ -18,6 +18,7 @@ from rtgs.config import compose
 from rtgs.config.locate import choices_of, conf_dir
 from rtgs.config.schema import RunConfig
 from rtgs.methods.settings import TransmittanceSettings
+from rtgs.optics.settings import WallSettings
 from rtgs.workflow.fingerprint import flatten
 
 GROUPS = ("scene", "sfm", "masks", "normals", "method", "tracking")  # nothing lies below their files but the schema
@@ -91,6 +92,7 @@ def test_no_ablation_restates_what_its_methods_have(ablation):
 
 
 def test_glass_has_the_numbers_of_the_schema():
-    """rtgs alone reads them: with its published preset they are the dataclass's own."""
+    """rtgs alone reads them: with its published preset they are the dataclass's own, but for the light of its walls."""
     config, _ = compose(["scene=demo", "method=rtgs", "preset=paper"])
-    assert config.method.transmittance == TransmittanceSettings()
+    walls = TransmittanceSettings(normal="mesh", wall=WallSettings(light="fresnel"))
+    assert config.method.transmittance == walls
