@@ -246,12 +246,6 @@ class TransmittanceSettings:
         for name in ("densify_every", "sh_every", "cells", "per_cell", "rebuild_every", "most_hits"):
             value = getattr(self, name)
             refuse_unless(value >= 1, f"method.transmittance.{name}", value, "at least 1")
-        inner = self.wall.light == "fresnel" and self.wall.bounces > 0
-        if inner and self.first_bounce != "transmittance":
-            raise RtgsError(
-                f"method.transmittance.wall.bounces={self.wall.bounces} follows light through the transmittance set, "
-                f"and method.transmittance.first_bounce={self.first_bounce} has none: set bounces to 0"
-            )
         every = self.opacity_reset_every
         refuse_unless(every >= 0, "method.transmittance.opacity_reset_every", every, "at least 0 (0: never)")
 

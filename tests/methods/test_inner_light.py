@@ -129,6 +129,16 @@ def test_without_inner_bounces_no_light_is_mirrored_inside(made: GlassScene):
     assert "transmission" in found.layers
 
 
+@pytest.mark.parametrize("first", ["base", "none"])
+def test_without_a_transmittance_set_no_light_is_followed_inside(made: GlassScene, first: str):
+    settings = fresnel(bounces=2)
+    settings = replace(settings, transmittance=replace(settings.transmittance, first_bounce=first))
+    found = shown(begun(settings, made), made)
+    assert found.layers is not None
+    assert "inner" not in found.layers
+    assert bool(torch.isfinite(found.image).all())
+
+
 def test_the_index_is_learned_where_it_may_and_goes_on_bit_for_bit(made: GlassScene):
     method = begun(fresnel(index_rate=0.01), made)
     (group,) = method.groups
@@ -150,10 +160,6 @@ def test_the_index_is_learned_where_it_may_and_goes_on_bit_for_bit(made: GlassSc
         (
             lambda: glass_recipe(wall=WallSettings(light="fresnel")),
             r"wall\.light=fresnel gives shares of linear light, but method\.optics\.blend=srgb",
-        ),
-        (
-            lambda: replace(fresnel().transmittance, first_bounce="base"),
-            r"wall\.bounces=1 follows light through the transmittance set",
         ),
         (lambda: fresnel(index=0.9), r"method\.transmittance\.wall\.index=0\.9 must be between 1\.05 and 2\.5"),
         (lambda: fresnel(bounces=-1), r"method\.transmittance\.wall\.bounces=-1 must be at least 0"),

@@ -151,6 +151,8 @@ class Glass(Part):
         """Walls that reflect as thin glass does, where the settings ask for them."""
         assert self.guide is not None
         walls = self.settings.transmittance.wall
+        if self.settings.transmittance.first_bounce != "transmittance":
+            walls = replace(walls, bounces=0)  # light mirrored inside is followed through the set that is missing
         self.wall = WallLight(walls, self.guide, self._glass) if walls.light == "fresnel" else None
 
     def _add_interface(self, mesh: ObjectMesh) -> StepEvent:
