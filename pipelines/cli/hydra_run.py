@@ -8,6 +8,7 @@ internal to Hydra; ``pyproject.toml`` bounds its version. What a run knows of it
 from __future__ import annotations
 
 import argparse
+import importlib
 import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -36,6 +37,7 @@ from rtgs.core.errors import RtgsError
 from rtgs.workflow import SweepOutcomes
 
 log = logging.getLogger("rtgs")
+TOPLEVEL_PLUGINS = "hydra_plugins"  # where Hydra wants them
 _JOB_NAME = "app"  # of the log file in a run's output folder
 
 
@@ -220,7 +222,6 @@ def _sweep(hydra: Hydra, name: str, overrides: list[str], app: HydraApp) -> None
 
 
 def _know_own_launcher() -> None:
-    """Hydra finds plugins by listing folders; an editable installation has none to list."""
-    from hydra_plugins.rtgs_dask_launcher import RtgsDaskLauncher
-
-    Plugins.instance().register(RtgsDaskLauncher)
+    """Hydra loads plugins by name from folders that it lists; an editable installation has none to list."""
+    plugin = importlib.import_module(f"{TOPLEVEL_PLUGINS}.rtgs_dask_launcher")
+    Plugins.instance().register(plugin.RtgsDaskLauncher)

@@ -193,6 +193,7 @@ def _choice_record(choice: Choice) -> MeshRecord:
         masks_outvoted=None if hull is None else hull.outvoted,
         trimmed=None if hull is None else hull.trimmed,
         trim_views=None if hull is None else hull.trim_views,
+        surface_fit=choice.fit,
     )
 
 

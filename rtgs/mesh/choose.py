@@ -15,9 +15,11 @@ from rtgs.core.refuse import refuse_unknown
 from rtgs.mesh.container import ObjectMesh
 from rtgs.mesh.hull import HullResult, carve_hull
 from rtgs.mesh.pane import drawn_pane, fit_pane, is_flat
+from rtgs.mesh.record import SurfaceFit
 from rtgs.mesh.settings import MeshSource, ObjectSettings
 from rtgs.mesh.silhouettes import MaskSet, SilhouetteScore, direction_spread, silhouette_score
 from rtgs.mesh.smoothing import volume
+from rtgs.mesh.surface import find_surface
 from rtgs.mesh.triangles import TriangleMesh, read_mesh_obj, read_mesh_ply
 
 _REMEDY = (
@@ -38,6 +40,7 @@ class Choice:
     candidates: dict[str, float]  # mean IoU of every mesh that was made
     decisions: tuple[Decision, ...]
     hull: HullResult | None
+    fit: SurfaceFit | None = None  # of the chosen mesh: how the hull was smoothed
 
 
 class _Candidates:
@@ -50,6 +53,7 @@ class _Candidates:
         self.decisions: list[Decision] = []
         self.hull: HullResult | None = None
         self.scores: dict[str, float] = {}
+        self.fit: SurfaceFit | None = None
 
     def score(self, mesh: TriangleMesh) -> SilhouetteScore:
         """Where an opaque thing may hide the object, pixels are left out; only a hull knows where."""
@@ -63,6 +67,16 @@ class _Candidates:
             done = f"hull trimmed to what {hull.trim_views} views see" if hull.trim_views else "hull not trimmed"
             self.decisions.append(Decision(done, hull.note))
         return ObjectMesh(hull.mesh, "hull", hull.voxel, flat=False)
+
+    def smoothed(self, found: ObjectMesh) -> ObjectMesh:
+        """The chosen hull with the surface that ``mesh.object.surface`` asks for."""
+        assert self.hull is not None
+        surface = find_surface(self.hull, self.masks, self.settings.surface, self.score)
+        self.decisions.append(surface.decision)
+        if surface.kind == "":
+            return found
+        self.fit, self.scores["surface"] = surface.fit, surface.fit.iou
+        return replace(found, mesh=surface.mesh, surface=surface.kind)
 
     def drawn(self) -> ObjectMesh | None:
         """The panes that somebody drew, where they explain the masks."""
@@ -151,6 +165,8 @@ def choose_object_mesh(
         if source != "hull":
             raise
         raise RtgsError(f"{error}: {_REMEDY}") from error
+    if mesh.source == "hull" and not mesh.flat and settings.surface.fit != "carved":
+        mesh = tried.smoothed(mesh)
     about = f"{len(masks.views)} masks, {masks.cut} cut by the image border"
     left = [f"{masks.without} views have no mask", f"{masks.empty} masks are empty", f"{masks.full} cover everything"]
     about += "".join(f", {text}" for text, count in zip(left, (masks.without, masks.empty, masks.full)) if count)
@@ -158,7 +174,7 @@ def choose_object_mesh(
     what = f"object mesh: {'a flat pane' if mesh.flat else mesh.source}"
     tried.decisions.insert(0, Decision(what, f"mesh.source is {source}; silhouette IoU: {scores}; {about}"))
     score, plain = tried.score(mesh.mesh), silhouette_score(mesh.mesh, masks.views)
-    return Choice(mesh, score, plain, tried.scores, tuple(tried.decisions), tried.hull)
+    return Choice(mesh, score, plain, tried.scores, tuple(tried.decisions), tried.hull, tried.fit)
 
 
 _MADE = {"tsdf": "fused", "given": "given"}

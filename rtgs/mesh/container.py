@@ -25,7 +25,8 @@ SOURCES = ("hull", "tsdf", "given")
 MERGE_VOXELS = 2.0  # crossings nearer than this are one wall (method.md 6.3)
 BOX_MARGIN = 0.05  # of the object box, on each side (method.md 6.2)
 _BOX_POINTS = 0.005  # share of the points behind a pane that its box leaves out at either end of each axis
-_NORMAL_ROUNDS, _NORMAL_REACH = 2, 5.0  # of smoothing; voxels; measured in docs/lab/mesh.md
+_NORMAL_ROUNDS = 2  # of smoothing; measured in docs/lab/mesh.md
+_NORMAL_REACH = {"": 5.0, "free": 2.0}  # voxels: of a mesh as it was found, of a smoothed one; not in it: none
 _BATCH = 65536  # points whose rays are cast at once
 
 
@@ -37,6 +38,7 @@ class ObjectMesh:
     source: str  # "hull", "tsdf" or "given"
     voxel: float  # world units: of the grid it was found on; walls nearer than 2 voxels are one
     flat: bool  # a pane: one wall, no interior; what is transmitted lies behind it
+    surface: str = ""  # how a hull was smoothed: "free"; empty: it is as it was carved
 
     def __post_init__(self) -> None:
         if len(self.mesh.faces) == 0:
@@ -55,9 +57,8 @@ class ObjectMesh:
     def corners(self) -> np.ndarray:
         """(F, 3, 3) float32 smoothed unit normals of the faces' corners; of a given mesh only a little."""
         corners = corner_normals(self.mesh, _NORMAL_ROUNDS)
-        if self.source == "given" or self.flat:
-            return corners
-        return neighbourhood_normals(self.mesh, corners, _NORMAL_REACH * self.voxel)
+        reach = 0.0 if self.source == "given" or self.flat else _NORMAL_REACH.get(self.surface, 0.0)
+        return neighbourhood_normals(self.mesh, corners, reach * self.voxel) if reach else corners
 
     @cached_property
     def rays(self) -> MeshGuide:
@@ -187,10 +188,12 @@ def _directions(count: int) -> np.ndarray:
 
 
 def write_object_mesh(folder: Path, mesh: ObjectMesh, record: MeshRecord | None = None) -> None:
-    """Write ``mesh.ply`` and ``mesh.json`` (source, voxel, flat, counts, and what ``record`` adds) into ``folder``."""
+    """Write ``mesh.ply`` and ``mesh.json`` (source, voxel, flat, surface, counts, and what ``record`` adds) into
+    ``folder``."""
     write_mesh_ply(folder / MESH_FILE, mesh.mesh)
     vertices, faces = len(mesh.mesh.vertices), len(mesh.mesh.faces)
     own = {"source": mesh.source, "voxel": mesh.voxel, "flat": mesh.flat, "vertices": vertices, "faces": faces}
+    own["surface"] = mesh.surface or None
     replace(record or MeshRecord(), **own).write(folder)
 
 
@@ -203,7 +206,8 @@ def read_object_mesh(folder: Path) -> ObjectMesh:
     record = MeshRecord.read(folder)
     if record.source is None or record.voxel is None or record.flat is None:
         raise damaged(folder / RECORD_FILE, "it describes no object mesh: source, voxel or flat is missing")
-    return ObjectMesh(read_mesh_ply(folder / MESH_FILE), record.source, record.voxel, record.flat)
+    mesh = read_mesh_ply(folder / MESH_FILE)
+    return ObjectMesh(mesh, record.source, record.voxel, record.flat, record.surface or "")
 
 
 @dataclass(frozen=True)

@@ -34,6 +34,31 @@ class MeshTruth:
 
 
 @dataclass(frozen=True)
+class SurfaceFit:
+    """A smoothed hull beside the hull.
+
+    Attributes:
+        iou_before, iou: silhouette IoU of the hull and of the surface with the masks, where nothing hides the object.
+        outline_before, outline: pixels between their outlines and those of the masks, root mean square.
+        strength: of smoothing: voxels, median over the vertices.
+        sharp: share of the vertices at which the outlines asked for less smoothing: edges.
+        unseen: share of the vertices that no outline tells of.
+        feet: unseen parts that were made plane.
+        held: unseen parts that stay as the hull has them.
+    """
+
+    iou_before: float
+    iou: float
+    outline_before: float
+    outline: float
+    strength: float
+    sharp: float
+    unseen: float
+    feet: int
+    held: int
+
+
+@dataclass(frozen=True)
 class MeshRecord:
     """One mesh, or why there is none. None: not known, or not of this kind of mesh; such a key is not written.
 
@@ -53,6 +78,8 @@ class MeshRecord:
         source: how the object's mesh was found: ``hull``, ``tsdf``, ``given``; None: a mesh of the scene.
         voxel: side of the grid's cells, world units.
         flat: the object is a pane.
+        surface: how the hull was smoothed: ``free``; None: it was not.
+        surface_fit: figures of that.
     """
 
     absent: str | None = None
@@ -74,6 +101,8 @@ class MeshRecord:
     source: str | None = None
     voxel: float | None = None
     flat: bool | None = None
+    surface: str | None = None
+    surface_fit: SurfaceFit | None = None
     vertices: int | None = None
     faces: int | None = None
 

@@ -9,8 +9,11 @@ import torch
 
 from rtgs.core.cameras import Camera
 from rtgs.mesh.container import ObjectGuide, ObjectMesh
+from rtgs.mesh.guide import MeshGuide
+from rtgs.mesh.normals import corner_normals, interpolated
 from rtgs.mesh.triangles import TriangleMesh
 
+_SHARES = (0.5, 0.9)  # quantiles of angles
 _RELATIVE = 0.03  # of the depth: nearer than this is the same surface (docs/mesh.md, "Figures")
 
 
@@ -138,6 +141,85 @@ def hit_score(mesh: ObjectMesh, truth: TriangleMesh, cameras: list[Camera]) -> H
         normal_median=float(angle.median()) if len(angle) else float("nan"),
         iou=shared / max(union, 1),
     )
+
+
+@dataclass(frozen=True)
+class NormalScore:
+    """Degrees between the normals of a mesh and of the true container, over the visible glass of some views."""
+
+    front: float  # at the first surface, median
+    front_90: float  # 90th percentile
+    back: float  # at the second one, where nothing opaque hides it
+    back_90: float
+    pixels: int  # with both first surfaces
+
+
+def normal_score(
+    mesh: ObjectMesh, truth: TriangleMesh, cameras: list[Camera], glass: list[torch.Tensor], opaque: list[torch.Tensor]
+) -> NormalScore:
+    """Normals of both surfaces against the true container's.
+
+    Args:
+        mesh: as the third stage has it: its smoothed corner normals count.
+        truth: the container, whose facets are fine enough to have normals of their own.
+        cameras: of the views.
+        glass: (H, W) bool for each: pixels whose first surface is transparent.
+        opaque: (H, W) z-depth for each of the first opaque surface, 0: none; what lies behind it does not count.
+    """
+    guide = MeshGuide(truth, mesh.merge_distance)
+    corners = corner_normals(truth)
+    front, back = [], []
+    for camera, where, depth in zip(cameras, glass, opaque, strict=True):
+        chosen = torch.nonzero(where.reshape(-1))[:, 0]
+        rays = camera.rays(torch.float64)
+        directions = rays.directions.reshape(-1, 3)[chosen].numpy()
+        origins = np.broadcast_to(rays.origin.numpy(), directions.shape).copy()
+        ours = _two_surfaces(mesh.rays, mesh.corners, origins, directions)
+        true = _two_surfaces(guide, corners, origins, directions)
+        behind = depth.reshape(-1)[chosen].double().numpy()
+        both = ours.second & true.second & ((behind <= 0) | (behind > true.far))
+        front.append(_degrees(ours.front, true.front)[ours.first & true.first])
+        back.append(_degrees(ours.back, true.back)[both])
+    first, second = np.concatenate(front), np.concatenate(back)
+    return NormalScore(*_quantiles(first), *_quantiles(second), pixels=len(first))
+
+
+@dataclass(frozen=True)
+class _TwoSurfaces:
+    """Along N rays."""
+
+    first: np.ndarray  # (N,) bool: there is one
+    second: np.ndarray  # (N,) bool
+    far: np.ndarray  # (N,) distance of the second one, in lengths of the ray's direction
+    front: np.ndarray  # (N, 3) unit normals, 0: none
+    back: np.ndarray  # (N, 3)
+
+
+def _two_surfaces(guide: MeshGuide, corners: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> _TwoSurfaces:
+    """The surfaces that a camera's :class:`ObjectGuide` finds, with the normals of both."""
+    hits, rows = guide.intersect(origins, directions), np.arange(len(directions))
+    first, near = hits.triangle[:, 0] >= 0, hits.distance[:, :1]
+    reach = guide.merge_distance / np.linalg.norm(directions, axis=1)
+    beyond = (hits.triangle >= 0) & (hits.distance > near + reach[:, None])
+    column = beyond.argmax(1)
+    second = beyond.any(1) & ~hits.back_facing[:, 0]
+    normals = []
+    for found, index in ((first, np.zeros_like(column)), (second, column)):
+        normal = np.zeros_like(directions)
+        rays = rows[found]
+        points = origins[rays] + hits.distance[rays, index[rays], None] * directions[rays]
+        normal[rays] = interpolated(guide.mesh, corners, hits.triangle[rays, index[rays]], points)
+        normals.append(normal)
+    return _TwoSurfaces(first, second, hits.distance[rows, column], *normals)
+
+
+def _quantiles(angles: np.ndarray) -> list[float]:
+    return [float(np.quantile(angles, share)) if len(angles) else float("nan") for share in _SHARES]
+
+
+def _degrees(ours: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """(N,) angle between lines along two normals: which side is out does not matter."""
+    return np.degrees(np.arccos(np.abs((ours * true).sum(1)).clip(0, 1)))
 
 
 def _share(found: list[torch.Tensor]) -> float:

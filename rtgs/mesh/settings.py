@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from rtgs.core.recipe import UNLESS_DEFAULT
 from rtgs.core.refuse import refuse_bad_numbers, refuse_unknown_words, refuse_unless
 
 MeshSource = Literal["auto", "hull", "tsdf", "given"]
@@ -84,6 +85,29 @@ class PaneSettings:
 
 
 @dataclass(frozen=True)
+class SurfaceSettings:
+    """How the hull is smoothed; light is mirrored in its normals (decision 62)."""
+
+    fit: Literal["carved", "free"] = "carved"  # free: as smooth as the masks' outlines allow
+    weakest: float = 1.5  # voxels that the smoothing begins with
+    strongest: float = 6.0  # and that it ends with where nothing contradicts
+    tolerance: float = 0.1  # pixels that the outlines may be off around a vertex, on the mean
+    iou_cost: float = 0.003  # silhouette IoU that the smoothed surface may lose against the hull
+    fill: float = 3.0  # voxels that an unseen part may leave the hull
+    foot_degrees: float = 30.0  # between an unseen part's plane border and the wall: from here on the part is plane
+
+    def __post_init__(self) -> None:
+        refuse_bad_numbers(self, "mesh.object.surface")
+        refuse_unknown_words(self, "mesh.object.surface")
+        for name, least in {"weakest": 1.0, "strongest": self.weakest}.items():
+            value = getattr(self, name)
+            refuse_unless(value >= least, f"mesh.object.surface.{name}", value, f"at least {least:g}")
+        for name, most in {"iou_cost": 1.0, "foot_degrees": 90.0}.items():
+            value = getattr(self, name)
+            refuse_unless(value <= most, f"mesh.object.surface.{name}", value, f"between 0 and {most:g}")
+
+
+@dataclass(frozen=True)
 class ObjectSettings:
     """The mesh of the transparent object (method.md 6.3; docs/mesh.md)."""
 
@@ -103,6 +127,7 @@ class ObjectSettings:
     """Largest connected pieces of the TSDF mesh that stay."""
     hull: HullSettings = field(default_factory=HullSettings)
     pane: PaneSettings = field(default_factory=PaneSettings)
+    surface: SurfaceSettings = field(default=SurfaceSettings(), metadata=UNLESS_DEFAULT)
 
     def __post_init__(self) -> None:
         refuse_bad_numbers(self, "mesh.object")
