@@ -48,5 +48,5 @@ def _why(found: Fairing, fit: SurfaceFit) -> str:
     said += f" contradict; silhouette IoU {fit.iou:.4f}, {fit.iou_before:.4f} as carved; outlines {fit.outline:.2f} px "
     said += f"off, {fit.outline_before:.2f} as carved; no outline tells of {100 * found.unseen:.1f} %"
     parts = [(found.feet, "made plane"), (found.held, "held where the hull is")]
-    said += "".join(f", {count} parts {what}" for count, what in parts if count)
+    said += "".join(f", {count} {'part' if count == 1 else 'parts'} {what}" for count, what in parts if count)
     return said
