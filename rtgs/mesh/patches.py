@@ -45,7 +45,7 @@ def unseen_patches(shape: MeshShape, seen: np.ndarray, voxel: float, foot_degree
         inside[vertices] = True
         rim = shape.grown(inside, _RINGS) & ~inside
         patch = Patch(vertices, rim, "smooth", np.zeros(len(vertices)))
-        if rim.any() and _slope(patch, shape) >= foot_degrees:
+        if rim.sum() >= 3 and _slope(patch, shape) >= foot_degrees:
             patch = foot_of(patch, shape, voxel, 3.0)
             patch = patch if patch.kind == "foot" else replace(patch, kind="smooth")
         found.append(patch)

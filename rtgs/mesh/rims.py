@@ -46,7 +46,7 @@ def rim_views(views: Sequence[MaskView], hidden: Sequence[Tensor]) -> list[RimVi
         usable = np.zeros(view.mask.shape, bool)
         usable[_BORDER:-_BORDER, _BORDER:-_BORDER] = True
         if behind.any():
-            usable &= ~np.asarray(binary_dilation(behind.numpy(), iterations=_HIDDEN))
+            usable &= np.logical_not(binary_dilation(behind.numpy(), iterations=_HIDDEN))
         found.append(RimView(view.camera, signed_distance((view.mask | behind).numpy()).numpy(), usable))
     return found
 

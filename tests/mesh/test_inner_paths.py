@@ -96,6 +96,7 @@ def test_no_light_is_mirrored_where_the_mesh_is_no_glass(ball: ObjectMesh):
     goes_on = torch.zeros(len(ends), dtype=torch.bool).index_fill(0, left.legs[1].parent, True)
     assert bool((ends[goes_on] < 0.02).all())
     assert bool((ends[~goes_on] > -0.02).all())
+    assert bool((left.legs[0].cosine[~goes_on] == 0).all()), "what is no glass lets nothing through"
     assert 0 < int(goes_on.sum()) < len(ends)
 
 

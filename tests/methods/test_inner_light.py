@@ -122,10 +122,27 @@ def test_the_layers_add_up_in_linear_light(made: GlassScene):
     torch.testing.assert_close(found.image, image, atol=1e-4, rtol=1e-3)
 
 
+def test_dark_contents_take_their_own_light_and_no_other(made: GlassScene):
+    """Behind a half transparent black ball everything else is dimmed, and nothing is counted as the ball's."""
+    method = begun(fresnel(), made)
+    contents = method["transmittance"].gaussians
+    with torch.no_grad():
+        contents.sh_dc.fill_(-0.5 / 0.28209479)
+        contents.sh_rest.zero_()
+        contents.opacity_logits.fill_(0.0)
+    found = shown(method, made)
+    assert found.layers is not None
+    light = {name: decoded(found.layers[name], "linear") for name in ("inner", "contents", "behind", "transmission")}
+    assert float(light["contents"].max()) < 1e-4
+    torch.testing.assert_close(light["inner"] + light["behind"], light["transmission"], atol=1e-4, rtol=1e-3)
+    assert float(light["behind"].max()) > 0.01
+
+
 def test_without_inner_bounces_no_light_is_mirrored_inside(made: GlassScene):
     found = shown(begun(fresnel(bounces=0), made), made)
     assert found.layers is not None
-    assert "inner" not in found.layers
+    assert float(found.layers["inner"].abs().max()) == 0
+    assert float(found.layers["behind"].max()) > 0
     assert "transmission" in found.layers
 
 
@@ -135,7 +152,7 @@ def test_without_a_transmittance_set_no_light_is_followed_inside(made: GlassScen
     settings = replace(settings, transmittance=replace(settings.transmittance, first_bounce=first))
     found = shown(begun(settings, made), made)
     assert found.layers is not None
-    assert "inner" not in found.layers
+    assert "inner" not in found.layers or float(found.layers["inner"].abs().max()) == 0
     assert bool(torch.isfinite(found.image).all())
 
 

@@ -151,8 +151,9 @@ class Glass(Part):
         """Walls that reflect as thin glass does, where the settings ask for them."""
         assert self.guide is not None
         walls = self.settings.transmittance.wall
-        if self.settings.transmittance.first_bounce != "transmittance":
-            walls = replace(walls, bounces=0)  # light mirrored inside is followed through the set that is missing
+        transmittance = self.settings.transmittance
+        if transmittance.first_bounce != "transmittance" or transmittance.second_bounce == "none":
+            walls = replace(walls, bounces=0)  # the set that it would be followed through, or the far wall, is missing
         self.wall = WallLight(walls, self.guide, self._glass) if walls.light == "fresnel" else None
 
     def _add_interface(self, mesh: ObjectMesh) -> StepEvent:
@@ -221,8 +222,9 @@ class Glass(Part):
         """What the mirror shows, and in transparent objects what straight rays meet."""
         if not self.begun or self.settings.transmittance.first_bounce == "none":
             return None
-        mirror, rays = self.mirror, frame.rays
-        glass = self.pixels(frame, mirror.surface(raster.buffers))
+        mirror, rays, shape = self.mirror, frame.rays, (frame.camera.height, frame.camera.width)
+        flat = mirror.surface(raster.buffers)
+        glass = self.pixels(frame, flat)
         chosen = mirror.choose(frame, raster.buffers, glass.flat, always=glass.inside)
         straight = glass_rays(glass, chosen.index, rays.center, rays.directions)
         inner = None
@@ -237,7 +239,7 @@ class Glass(Part):
             chosen,
             met.pixels,
             (met.light(reflection), through),
-            {"transparent": glass.inside.reshape(frame.camera.height, frame.camera.width)},
+            {"transparent": glass.inside.reshape(shape), "specular": flat.specular.reshape(shape)},
             passed.first_bounce,
             (*met.observations, *passed.observations),
         )
@@ -303,9 +305,8 @@ class Glass(Part):
             frame.training and self._depth_loss_on(frame.step),
             frame.training and own is not None and self._watching(own, frame.step),
         )
-        if inner is None or surroundings is None or self.wall is None:
-            return straight.transmit(frame, rays)
-        return straight.transmit(frame, rays, FarWall(inner, surroundings, self.wall.index))
+        wall = None if self.wall is None else FarWall(inner, surroundings, self.wall.index)
+        return straight.transmit(frame, rays, wall)
 
     def _own_degree(self, step: int) -> int:
         """SH degree of the transmittance set: grown on its own clock, but never below what it came with."""
