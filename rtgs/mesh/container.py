@@ -38,7 +38,7 @@ class ObjectMesh:
     source: str  # "hull", "tsdf" or "given"
     voxel: float  # world units: of the grid it was found on; walls nearer than 2 voxels are one
     flat: bool  # a pane: one wall, no interior; what is transmitted lies behind it
-    surface: str = ""  # how a hull was smoothed: "free"; empty: it is as it was carved
+    surface: str = ""  # how a hull was smoothed: "free", "sphere", ...; empty: it is as it was carved
 
     def __post_init__(self) -> None:
         if len(self.mesh.faces) == 0:
