@@ -80,7 +80,7 @@ class MeshRecord:
         source: how the object's mesh was found: ``hull``, ``tsdf``, ``given``; None: a mesh of the scene.
         voxel: side of the grid's cells, world units.
         flat: the object is a pane.
-        surface: how the hull was smoothed: ``free``, ``sphere``, ``revolution``; None: it was not.
+        surface: how the hull was smoothed: ``free``, ``sphere``, ``revolution``, ``planes``; None: it was not.
         surface_fit: figures of that.
     """
 

@@ -89,14 +89,14 @@ class SurfaceSettings:
     """How the hull is smoothed; light is mirrored in its normals (decision 62)."""
 
     fit: Literal["carved", "free", "auto"] = "carved"
-    """``free``: as smooth as the masks' outlines allow; ``auto``: a sphere or a surface of revolution where they do not
-    contradict it, else free."""
+    """``free``: as smooth as the masks' outlines allow; ``auto``: a sphere, a surface of revolution or a body of planes
+    where they do not contradict it, else free."""
     weakest: float = 1.5  # voxels that the smoothing begins with
     strongest: float = 6.0  # and that it ends with where nothing contradicts
     tolerance: float = 0.1  # pixels that the outlines may be off around a vertex, on the mean
     iou_cost: float = 0.003  # silhouette IoU that the smoothed surface may lose against the hull
     fill: float = 3.0  # voxels that an unseen part may leave the hull
-    contradicted: float = 0.15  # share of its seen area where the outlines may contradict a sphere or a turned surface
+    contradicted: float = 0.15  # share of its seen area where the outlines may contradict a fitted form
     foot_degrees: float = 30.0  # between an unseen part's plane border and the wall: from here on the part is plane
 
     def __post_init__(self) -> None:

@@ -1,7 +1,7 @@
 """The surface that light is traced with: what explains the masks' outlines most simply.
 
-A sphere, a surface of revolution, or the hull made as smooth as the outlines allow: the first that they do not
-contradict.
+A sphere, a surface of revolution, a body of planes, or the hull made as smooth as the outlines allow: the first that
+they do not contradict.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from rtgs.mesh.ball import fit_ball
 from rtgs.mesh.fairing import contradicted_share, fair_surface
 from rtgs.mesh.hull import HullResult
 from rtgs.mesh.operators import MeshShape
+from rtgs.mesh.polyhedron import fit_planes
 from rtgs.mesh.record import SurfaceFit
 from rtgs.mesh.revolution import fit_revolution
 from rtgs.mesh.rims import RimView, find_rims, rim_views
@@ -30,7 +31,7 @@ class Surface:
     """What became of the hull."""
 
     mesh: TriangleMesh
-    kind: str  # "sphere", "revolution", "free", or empty: the hull stays
+    kind: str  # "sphere", "revolution", "planes", "free", or empty: the hull stays
     fit: SurfaceFit
     decision: Decision
 
@@ -41,6 +42,7 @@ class _Candidate:
     kind: str
     said: str  # what it is
     fit: SurfaceFit  # what is known before it is judged
+    contradicted: float | None = None  # share where the outlines are off; None: by its rims
 
 
 _NOTHING = SurfaceFit(0.0, 0.0, 0.0, 0.0, 0.0)
@@ -56,7 +58,10 @@ def find_surface(hull: HullResult, masks: MaskSet, settings: SurfaceSettings, sc
     for found in _candidates(hull, views, settings):
         shape = MeshShape.of(found.mesh)
         rims = find_rims(shape, views)
-        share = contradicted_share(shape, rims, hull.voxel, settings.tolerance)
+        share = found.contradicted
+        if share is None:
+            share = contradicted_share(shape, rims, hull.voxel, settings.tolerance)
+        cost = settings.iou_cost if found.kind != "planes" else 0.0  # edges alone tell too little of what lies between
         iou = score(found.mesh).mean
         fit = replace(
             found.fit, iou_before=carved, iou=iou, outline_before=before, outline=rims.spread, contradicted=share
@@ -64,9 +69,9 @@ def find_surface(hull: HullResult, masks: MaskSet, settings: SurfaceSettings, sc
         if found.kind != "free" and share > settings.contradicted:
             why = f"outlines contradict it on {100 * share:.0f} % of its area"
             refused.append(f"{found.said}: {why} (mesh.object.surface.contradicted {settings.contradicted:g})")
-        elif iou < carved - settings.iou_cost:
+        elif iou < carved - cost:
             why = f"silhouette IoU {iou:.4f}, {carved:.4f} as carved"
-            refused.append(f"{found.said}: {why} (mesh.object.surface.iou_cost {settings.iou_cost:g})")
+            refused.append(f"{found.said}: {why} (it may cost {cost:g}, mesh.object.surface.iou_cost)")
         else:
             why = "; ".join([f"{found.said}; {_figures(fit)}", *(f"not {text}" for text in refused)])
             return Surface(found.mesh, found.kind, fit, Decision(f"hull smoothed: {found.kind}", why))
@@ -84,6 +89,10 @@ def _candidates(hull: HullResult, views: list[RimView], settings: SurfaceSetting
             said = f"a surface of revolution, its profile smoothed over {turned.length:g} voxels"
             fit = replace(_NOTHING, strength=turned.length, unseen=1 - float(turned.seen.mean()))
             yield _Candidate(turned.mesh(), "revolution", said, fit)
+        flat = fit_planes(hull.mesh, hull.voxel, views, settings.tolerance)
+        if flat is not None:
+            said = f"a body of {len(flat.body.normals)} planes"
+            yield _Candidate(flat.body.mesh(hull.voxel), "planes", said, _NOTHING, flat.contradicted)
     free = fair_surface(hull.mesh, hull.voxel, views, settings)
     said = f"smoothed over {free.strength:.1f} voxels, less at {100 * free.sharp:.0f} % of the vertices, where the "
     said += f"outlines contradict; no outline tells of {100 * free.unseen:.1f} %"
