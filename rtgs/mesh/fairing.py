@@ -51,18 +51,15 @@ class Fairing:
     unseen: float  # share of the vertices that no rim comes near
     feet: int  # unseen parts that were made plane
     held: int  # unseen parts that stay where the hull is
-    spread_before: float  # pixels between the outlines of hull and masks, root mean square
-    spread: float  # of the smoothed surface
 
 
 def fair_surface(hull: TriangleMesh, voxel: float, views: Sequence[RimView], settings: SurfaceSettings) -> Fairing:
     """The hull smoothed as far as the masks' outlines allow; same triangles."""
     shape = MeshShape.of(hull).relaxed(_ROUNDS)
     state = _Strengths(np.full(len(shape.vertices), settings.weakest), np.zeros(len(shape.vertices), bool))
-    level, before, patches = settings.weakest, 0.0, []
+    level = settings.weakest
     while True:
         system = _System(shape, find_rims(shape, views), voxel)
-        before = before or system.rims.spread
         heights, patches = _solved(system, state, level, settings)
         limit = _LONGEST * voxel
         moved = shape.vertices + np.clip(heights, -limit, limit)[:, None] * shape.normals
@@ -70,11 +67,21 @@ def fair_surface(hull: TriangleMesh, voxel: float, views: Sequence[RimView], set
         if level >= settings.strongest or state.sharp.mean() > 0.5:
             break
         level = min(level * _GROWTH, settings.strongest)
-    spread = find_rims(shape, views).spread
     feet, held = (sum(patch.kind == kind for patch in patches) for kind in ("foot", "held"))
     unseen = 1 - float(system.seen.mean())
     strength = float(np.median(state.length))
-    return Fairing(shape.mesh(), strength, float(state.sharp.mean()), unseen, feet, held, before, spread)
+    return Fairing(shape.mesh(), strength, float(state.sharp.mean()), unseen, feet, held)
+
+
+def contradicted_share(shape: MeshShape, rims: Rims, voxel: float, tolerance: float) -> float:
+    """Share of the seen area of a surface with these rims where they are off by more than the noise of the masks and
+    ``tolerance``, pixels; 1: there are no rims."""
+    if len(rims) == 0:
+        return 1.0
+    system = _System(shape, rims, voxel)
+    noise = float(np.clip(1.48 * np.median(np.abs(rims.pixels)), *_NOISE))
+    area = np.where(system.seen, shape.area, 0.0)
+    return float(area[system.contradicted(rims.pixels, noise, tolerance)].sum() / max(area.sum(), 1e-300))
 
 
 @dataclass
