@@ -43,6 +43,7 @@ OVERRIDES = (
     ("rtgs", "masks=none normals=none"),
     ("rtgs", "mesh.source=tsdf mesh.of=scene mesh.object.flat=yes mesh.tsdf.max_blocks=5000"),
     ("rtgs", "mesh.source=hull mesh.object.hull.voxels=64 mesh.object.pane.agree=0.5"),
+    ("rtgs", "mesh.object.surface.fit=auto mesh.object.surface.contradicted=0.1"),
     ("envgs", "method.optics.blend=linear method.optics.weight=split_sum"),
     ("envgs", "method.transmittance.interface.normal_hold=5.0 method.transmittance.first_surface=base"),
     ("envgs", "method.reflection.density.strategy=mcmc method.density.strategy=mcmc"),
