@@ -99,7 +99,7 @@ def _solved(
     """(V,) heights at a smoothing length, less where the outlines contradict; ``state`` learns of both."""
     first = state.noise == 0.0
     state.length = np.where(state.sharp, state.length, level)
-    patches = unseen_patches(system.shape, system.seen, system.voxel, settings.foot_degrees)
+    patches = unseen_patches(system.shape, system.seen, system.voxel, settings.foot_degrees, settings.fill)
     fixed = [patch for patch in patches if patch.kind == "foot"]
     for attempt in range(_RETREATS + 1):
         for patch in fixed:
