@@ -86,16 +86,18 @@ class InnerGuide:
         size = float(np.linalg.norm(mesh.bounds[1] - mesh.bounds[0]))
         self._off, self._nearest = OFF_THE_WALL * size, 0.5 * mesh.voxel
         self._cache: dict[tuple[object, ...], InnerPaths] = {}
+        self._held = 0  # bytes
 
     def paths(self, camera: Camera, guide: ObjectGuide) -> InnerPaths:
         """Behind the pixels of ``camera`` whose far wall is glass; ``guide`` of the same mesh."""
         key = camera_key(camera)
         found = self._cache.pop(key, None)
-        found = self._find(camera, guide.surfaces(camera)) if found is None else found
-        self._cache[key] = found
-        held = sum(each.bytes for each in self._cache.values())
-        while held > CACHED_BYTES and len(self._cache) > 1:
-            held -= self._cache.pop(next(iter(self._cache))).bytes
+        if found is None:
+            found = self._find(camera, guide.surfaces(camera))
+            self._held += found.bytes
+            while self._cache and self._held > CACHED_BYTES:
+                self._held -= self._cache.pop(next(iter(self._cache))).bytes
+        self._cache[key] = found  # the newest is last
         return found
 
     def _find(self, camera: Camera, surfaces: ObjectSurfaces) -> InnerPaths:
@@ -103,12 +105,9 @@ class InnerGuide:
         rays = camera.rays(torch.float64)
         directions = rays.directions.reshape(-1, 3)[pixels].numpy()
         origins = np.broadcast_to(rays.origin.numpy(), directions.shape).copy()
-        hits = self.mesh.rays.intersect(origins, directions)
-        far = surfaces.far.flatten()[pixels].double().numpy()
-        nearest = np.abs(np.where(np.isfinite(hits.distance), hits.distance, np.inf) - far[:, None]).argmin(1)
-        rows = np.arange(len(pixels))
-        triangle, distance = hits.triangle[rows, nearest], hits.distance[rows, nearest]
-        kept = np.isfinite(distance)
+        pair = self.mesh.rays.along(torch.from_numpy(origins), torch.from_numpy(directions))
+        triangle, distance = pair.far_triangle.numpy(), pair.far.double().numpy()
+        kept = triangle >= 0
         kept[kept] &= self._glass[triangle[kept]]
         points = origins[kept] + distance[kept, None] * directions[kept]
         unit = directions[kept] / np.linalg.norm(directions[kept], axis=1, keepdims=True)

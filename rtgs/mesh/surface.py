@@ -97,7 +97,7 @@ def _candidates(hull: HullResult, views: list[RimView], settings: SurfaceSetting
     said = f"smoothed over {free.strength:.1f} voxels, less at {100 * free.sharp:.0f} % of the vertices, where the "
     said += f"outlines contradict; no outline tells of {100 * free.unseen:.1f} %"
     parts = [(free.feet, "made plane"), (free.held, "held where the hull is")]
-    said += "".join(f", {count} parts {what}" for count, what in parts if count)
+    said += "".join(f", {count} part{'s' if count > 1 else ''} {what}" for count, what in parts if count)
     fit = replace(
         _NOTHING, strength=free.strength, sharp=free.sharp, unseen=free.unseen, feet=free.feet, held=free.held
     )

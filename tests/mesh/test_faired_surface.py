@@ -10,13 +10,15 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from rtgs.core.errors import RtgsError
+from rtgs.mesh import fairing
 from rtgs.mesh.ball import fit_ball
 from rtgs.mesh.choose import choose_object_mesh
 from rtgs.mesh.container import ObjectMesh, read_object_mesh, write_object_mesh
-from rtgs.mesh.fairing import fair_surface
+from rtgs.mesh.fairing import contradicted_share, fair_surface
 from rtgs.mesh.hull import HullResult, carve_hull
 from rtgs.mesh.lathe import Axis, lathe
 from rtgs.mesh.operators import MeshShape
+from rtgs.mesh.patches import Patch, foot_of
 from rtgs.mesh.polyhedron import Polyhedron, fit_planes
 from rtgs.mesh.revolution import mean_profile, normals_axis
 from rtgs.mesh.rims import find_rims, rim_views
@@ -169,6 +171,45 @@ def test_bodies_of_planes() -> None:
     assert Polyhedron.of(normals[:5], np.full(5, 0.5), inside) is None, "open on one side"
     hull, masks = carved(BODIES["sphere"], 32)
     assert fit_planes(hull.mesh, hull.voxel, rim_views(masks.views, hull.hidden), 0.1) is None
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_a_hull_that_no_outline_tells_of_stays() -> None:
+    """Everything hidden: no rim, no noise to measure, and nothing to move to."""
+    hull, masks = carved(BODIES["sphere"], 16)
+    unseen = rim_views(masks.views, [torch.ones_like(view.mask) for view in masks.views])
+    found = fair_surface(hull.mesh, hull.voxel, unseen, FREE)
+    assert found.unseen == 1
+    assert np.isfinite(found.mesh.vertices).all()
+    assert volume(found.mesh) == pytest.approx(volume(hull.mesh), rel=0.2)
+    shape = MeshShape.of(found.mesh)
+    assert contradicted_share(shape, find_rims(shape, unseen), hull.voxel, 0.1) == 1
+
+
+def test_a_part_with_hardly_a_border_is_held() -> None:
+    shape = MeshShape.of(BODIES["sphere"])
+    rim = np.zeros(len(shape.vertices), bool)
+    part = Patch(np.arange(2, 12), rim, "smooth", np.ones(10))
+    for corners in (0, 2):
+        rim[:corners] = True
+        found = foot_of(part, shape, 0.05, 3.0)
+        assert found.kind == "held"
+        assert not found.heights.any()
+
+
+def test_parts_that_the_fill_leaves_too_far_are_all_held_or_plane(monkeypatch: pytest.MonkeyPatch) -> None:
+    """However late it shows: with no retreat left, too."""
+    hull, masks = carved(BODIES["sphere"], 24)
+    low = torch.zeros_like(masks.views[0].mask)
+    low[low.shape[0] // 2 :] = True
+    views = rim_views(masks.views, [low] * len(masks.views))
+    settings = replace(FREE, foot_degrees=90.0)
+    free = fair_surface(hull.mesh, hull.voxel, views, settings)
+    assert free.unseen > 0
+    assert free.feet + free.held == 0
+    monkeypatch.setattr(fairing, "_RETREATS", 0)
+    found = fair_surface(hull.mesh, hull.voxel, views, replace(settings, fill=1e-6))
+    assert found.feet + found.held > 0
 
 
 def found_of(hull: HullResult, masks: MaskSet) -> Surface:

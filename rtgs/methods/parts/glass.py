@@ -273,7 +273,7 @@ class Glass(Part):
             first_surface=settings.first_surface,
             normal=settings.normal,
         )
-        return made if self.wall is None else self.wall.on_glass(made, made.known)
+        return made if self.wall is None else self.wall.on_glass(made)
 
     def on_glass(self, surfaces: ObjectSurfaces) -> Tensor:
         """(H, W) bool: the mesh's first surface is one of the object's, not a lid or a label."""
