@@ -18,7 +18,7 @@ from rtgs.mesh.container import ObjectGuide, ObjectMesh, ObjectSurfaces
 from rtgs.mesh.silhouettes import bounding
 from rtgs.methods.parts.base import BaseSet, composited
 from rtgs.methods.parts.gaussian_set import GaussianSet, densified, opacity_reset
-from rtgs.methods.parts.glass_evidence import glass_faces, has_masks, on_surface, seen_bare
+from rtgs.methods.parts.glass_evidence import glass_faces, has_masks, near_surface, on_surface, seen_bare
 from rtgs.methods.parts.glass_sets import drawn_in_box, interface_set, taken_from_base, transmittance_set
 from rtgs.methods.parts.interface_set import InterfaceSet, interface_surfels
 from rtgs.methods.parts.mirror import Mirror, Reflected, stored_surfels
@@ -115,8 +115,7 @@ class Glass(Part):
             return ()
         why = "the masks of the training views are empty, or cover all of them"
         if self._left_out != NOT_MASKED:
-            share = f"{self._left_out:.1%} of its pixels"
-            why = f"the masked object looks opaque: in {share} the photos show its own surface "
+            why = f"the masked object looks opaque: {self._left_out:.1%} of what its pixels show is its own surface "
             why += "(method.transmittance.opaque_share)"
         return (Decision("no transmittance stage", why),)
 
@@ -174,7 +173,12 @@ class Glass(Part):
         assert self.guide is not None
         if border >= 1 or self.guide.mesh.source == "tsdf":  # that mesh is what the photos show, whatever it is
             return None
-        share = on_surface(self.guide, self._views, lambda camera: self._opaque(camera, step))
+
+        def weights(camera: Camera, depth: Tensor, reach: float) -> tuple[Tensor, Tensor]:
+            means = self.base.set.gaussians.means.detach()
+            return self.base.weight_of(near_surface(means, camera, depth, reach), camera, step)
+
+        share = on_surface(self.guide, self._views, weights)
         return share if share is not None and share > border else None
 
     def _leave_out(self, share: float) -> None:
