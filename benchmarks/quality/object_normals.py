@@ -1,6 +1,6 @@
 """Normals of the transparent object's mesh against the truth, as carved and smoothed.
 
-``python -m benchmarks.quality.object_normals [SCENE ...] [--long-side N] [--depth exact|none] [--fits carved free]``
+``python -m benchmarks.quality.object_normals [SCENE ...] [--long-side N] [--depth exact|none] [--fits FIT ...]``
 
 For each shipped scene with a true container: the hull of its training masks, then what every asked
 ``mesh.object.surface.fit`` makes of it. Degrees between its normals and the true ones, median and 90th percentile over
@@ -34,7 +34,7 @@ from rtgs.scenes.scene import Scene, load_scene
 from rtgs.scenes.settings import SceneSettings
 
 SCENES = ("ball_statue", "tall_bottle", "real_bottle", "popcorn_cup", "thick_ball")
-FITS = ("carved", "free")
+FITS = ("carved", "free", "auto")
 HEADER = "| scene | fit | front | back | IoU | s | chosen |"
 
 

@@ -148,7 +148,7 @@ def clocks(clock: PartClock) -> Iterator[None]:
         (GaussianSet, "_clamp", "adam"),
         (GaussianSet, "densify", "density"),
         (DensityControl, "observe", "density"),
-        (Mirror, "_choose", "choose"),
+        (Mirror, "choose", "choose"),
     ]
     undo = [clock.wrap(*entry) for entry in wanted]
     try:

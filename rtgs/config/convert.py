@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
@@ -14,6 +14,7 @@ from rtgs.config.schema import Choices, RunConfig
 from rtgs.core.build import build
 from rtgs.core.errors import RtgsError
 from rtgs.methods import find_method, own_methods
+from rtgs.methods.settings import MethodSettings
 from rtgs.methods.spec import FEATURES
 
 _UNTELLING = {"images", "input", "rgb", "sparse", "colmap", "0", "data", "dense", "undistorted"}
@@ -33,8 +34,7 @@ def to_run_config(composed: DictConfig, choices: Choices) -> tuple[RunConfig, Ch
     assert isinstance(values, dict)
     config = build(RunConfig, {str(key): value for key, value in values.items()})
     _refuse_idle_ablation(config, choices)
-    if config.method.own:
-        find_method(config.method.name).own_settings(config.method)
+    config = replace(config, method=_with_own(config.method))
     scene = config.scene
     if config.table.data == "paper" and scene.path.startswith("embedded:"):
         raise RtgsError(
@@ -55,6 +55,19 @@ def to_run_config(composed: DictConfig, choices: Choices) -> tuple[RunConfig, Ch
     if name != Path(name).name or name == "..":
         raise RtgsError(f"config: name={name!r} is to be one folder in runs/: give a name without / that is not ..")
     return replace(config, name=name), choices
+
+
+def _with_own(method: MethodSettings) -> MethodSettings:
+    """The settings with those of ``method.own`` that differ from their defaults, in one spelling: 1 and 1.0 are one
+    recipe.
+
+    Raises:
+        RtgsError: a key that the method does not have, or a value it cannot take.
+    """
+    if not method.own:
+        return replace(method, own={})
+    made = find_method(method.name).own_settings(method)
+    return replace(method, own={k: v for k, v in asdict(made).items() if v != getattr(type(made)(), k)})
 
 
 def _refuse_idle_ablation(config: RunConfig, choices: Choices) -> None:

@@ -221,6 +221,11 @@ def _open(value: Any, twin: type) -> Any:
 
 def register_schema() -> None:
     """Put the schema into Hydra's config store, under the name that ``conf/config.yaml`` lists first."""
-    from hydra.core.config_store import ConfigStore
+    from hydra.core.config_store import ConfigNode, ConfigStore
+    from omegaconf import OmegaConf
 
-    ConfigStore.instance().store(name=SCHEMA_NAME, node=open_schema(RunConfig), provider="rtgs")
+    schema, store = open_schema(RunConfig), ConfigStore.instance()
+    there = store.repo.get(f"{SCHEMA_NAME}.yaml")
+    if isinstance(there, ConfigNode) and OmegaConf.get_type(there.node) is schema:
+        return  # making the node takes a quarter of the time of composing a config
+    store.store(name=SCHEMA_NAME, node=schema, provider="rtgs")

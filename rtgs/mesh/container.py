@@ -26,6 +26,7 @@ MERGE_VOXELS = 2.0  # crossings nearer than this are one wall (method.md 6.3)
 BOX_MARGIN = 0.05  # of the object box, on each side (method.md 6.2)
 _BOX_POINTS = 0.005  # share of the points behind a pane that its box leaves out at either end of each axis
 _NORMAL_ROUNDS = 2  # of smoothing; measured in docs/lab/mesh.md
+_PLANES_CREASE = 5.0  # degrees between faces of a body of planes that are two planes
 _NORMAL_REACH = {"": 5.0, "free": 2.0}  # voxels: of a mesh as it was found, of a smoothed one; not in it: none
 _BATCH = 65536  # points whose rays are cast at once
 
@@ -38,7 +39,7 @@ class ObjectMesh:
     source: str  # "hull", "tsdf" or "given"
     voxel: float  # world units: of the grid it was found on; walls nearer than 2 voxels are one
     flat: bool  # a pane: one wall, no interior; what is transmitted lies behind it
-    surface: str = ""  # how a hull was smoothed: "free"; empty: it is as it was carved
+    surface: str = ""  # how a hull was smoothed: "free", "sphere", ...; empty: it is as it was carved
 
     def __post_init__(self) -> None:
         if len(self.mesh.faces) == 0:
@@ -56,6 +57,8 @@ class ObjectMesh:
     @cached_property
     def corners(self) -> np.ndarray:
         """(F, 3, 3) float32 smoothed unit normals of the faces' corners; of a given mesh only a little."""
+        if self.surface == "planes":
+            return corner_normals(self.mesh, 0, _PLANES_CREASE)
         corners = corner_normals(self.mesh, _NORMAL_ROUNDS)
         reach = 0.0 if self.source == "given" or self.flat else _NORMAL_REACH.get(self.surface, 0.0)
         return neighbourhood_normals(self.mesh, corners, reach * self.voxel) if reach else corners

@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,7 @@ from rtgs.mesh.triangles import TriangleMesh
 _GROWTH = 2.4  # of the smoothing length from level to level
 _RETREAT = 0.4  # of it where the outlines contradict
 _LEAST = 1.0  # voxels: at an edge
-_RETREATS = 2  # of each level
+_RETREATS = 2  # of the smoothing length, at each level
 _WINDOW = 2.0  # voxels: around a vertex, over which residuals are averaged
 _PER_VIEW = 5.0  # samples in a window that come from one view: their errors are alike
 _SIGNIFICANT = 1.5  # standard errors: less smoothing where nothing is wrong costs little
@@ -51,18 +52,15 @@ class Fairing:
     unseen: float  # share of the vertices that no rim comes near
     feet: int  # unseen parts that were made plane
     held: int  # unseen parts that stay where the hull is
-    spread_before: float  # pixels between the outlines of hull and masks, root mean square
-    spread: float  # of the smoothed surface
 
 
 def fair_surface(hull: TriangleMesh, voxel: float, views: Sequence[RimView], settings: SurfaceSettings) -> Fairing:
     """The hull smoothed as far as the masks' outlines allow; same triangles."""
     shape = MeshShape.of(hull).relaxed(_ROUNDS)
     state = _Strengths(np.full(len(shape.vertices), settings.weakest), np.zeros(len(shape.vertices), bool))
-    level, before, patches = settings.weakest, 0.0, []
+    level = settings.weakest
     while True:
         system = _System(shape, find_rims(shape, views), voxel)
-        before = before or system.rims.spread
         heights, patches = _solved(system, state, level, settings)
         limit = _LONGEST * voxel
         moved = shape.vertices + np.clip(heights, -limit, limit)[:, None] * shape.normals
@@ -70,11 +68,21 @@ def fair_surface(hull: TriangleMesh, voxel: float, views: Sequence[RimView], set
         if level >= settings.strongest or state.sharp.mean() > 0.5:
             break
         level = min(level * _GROWTH, settings.strongest)
-    spread = find_rims(shape, views).spread
     feet, held = (sum(patch.kind == kind for patch in patches) for kind in ("foot", "held"))
     unseen = 1 - float(system.seen.mean())
     strength = float(np.median(state.length))
-    return Fairing(shape.mesh(), strength, float(state.sharp.mean()), unseen, feet, held, before, spread)
+    return Fairing(shape.mesh(), strength, float(state.sharp.mean()), unseen, feet, held)
+
+
+def contradicted_share(shape: MeshShape, rims: Rims, voxel: float, tolerance: float) -> float:
+    """Share of the seen area of a surface with these rims where they are off by more than the noise of the masks and
+    ``tolerance``, pixels; 1: there are no rims."""
+    if len(rims) == 0:
+        return 1.0
+    system = _System(shape, rims, voxel)
+    noise = _noise(rims.pixels)
+    area = np.where(system.seen, shape.area, 0.0)
+    return float(area[system.contradicted(rims.pixels, noise, tolerance)].sum() / max(area.sum(), 1e-300))
 
 
 @dataclass
@@ -92,26 +100,31 @@ def _solved(
     """(V,) heights at a smoothing length, less where the outlines contradict; ``state`` learns of both."""
     first = state.noise == 0.0
     state.length = np.where(state.sharp, state.length, level)
-    patches = unseen_patches(system.shape, system.seen, system.voxel, settings.foot_degrees)
+    patches = unseen_patches(system.shape, system.seen, system.voxel, settings.foot_degrees, settings.fill)
     fixed = [patch for patch in patches if patch.kind == "foot"]
-    for attempt in range(_RETREATS + 1):
+    for attempt in count():
         for patch in fixed:
             state.sharp |= patch.rim
             state.length[patch.rim] = np.minimum(state.length[patch.rim], _LEAST)
         heights = system.heights(state.length, state.sharp, fixed)
         residual = (system.rims.offset - system.samples @ heights) / system.rims.pixel
-        state.noise = state.noise or float(np.clip(1.48 * np.median(np.abs(residual)), *_NOISE))
+        state.noise = state.noise or _noise(residual)
         against = system.contradicted(residual, state.noise, settings.tolerance)
         far = [patch for patch in patches if patch not in fixed and _beyond(heights, patch, system, settings)]
-        if attempt == _RETREATS or (not far and (first or not against.any())):
+        if not far and (first or attempt >= _RETREATS or not against.any()):
             break
         fixed += [foot_of(patch, system.shape, system.voxel, settings.fill) for patch in far]
         patches = [patch for patch in patches if patch not in far] + fixed[len(fixed) - len(far) :]
-        if not first:
+        if not first and attempt < _RETREATS:
             near = system.shape.grown(against, 2)
             state.sharp |= near
             state.length[near] = np.maximum(_RETREAT * state.length[near], _LEAST)
     return heights, patches
+
+
+def _noise(pixels: np.ndarray) -> float:
+    """Pixels: the masks' own noise, by residuals (R,); the least that it is thought to be where there are none."""
+    return float(np.clip(1.48 * np.median(np.abs(pixels)), *_NOISE)) if len(pixels) else _NOISE[0]
 
 
 def _beyond(heights: np.ndarray, patch: Patch, system: _System, settings: SurfaceSettings) -> bool:

@@ -40,6 +40,7 @@ class SurfacePair:
     near_triangle: Tensor  # int64, -1: no surface
     near_back_facing: Tensor  # bool: the first crossing leaves the object (the ray starts inside, or the mesh is open)
     far: Tensor  # float32; inf: no second surface
+    far_triangle: Tensor  # int64, -1: no second surface
     far_back_facing: Tensor  # bool: one of the crossings merged into it leaves the object
 
     @property
@@ -88,6 +89,7 @@ class MeshGuide:
             pair.near_triangle.reshape(shape),
             pair.near_back_facing.reshape(shape),
             pair.far.reshape(shape),
+            pair.far_triangle.reshape(shape),
             pair.far_back_facing.reshape(shape),
         )
 
@@ -99,13 +101,16 @@ class MeshGuide:
         near, valid = hits.distance[:, :1], hits.triangle >= 0
         beyond = valid & (hits.distance > near + reach)
         eligible = beyond & hits.back_facing if back_facing else beyond
-        far = np.where(eligible, hits.distance, np.inf).min(1)
+        distance, rows = np.where(eligible, hits.distance, np.inf), np.arange(len(lengths))
+        second = distance.argmin(1)
+        far = distance[rows, second]
         in_far_group = beyond & (hits.distance >= far[:, None]) & (hits.distance <= far[:, None] + reach)
         return SurfacePair(
             near=torch.from_numpy(near[:, 0].astype(np.float32)),
             near_triangle=torch.from_numpy(hits.triangle[:, 0].astype(np.int64)),
             near_back_facing=torch.from_numpy(hits.back_facing[:, 0].copy()),
             far=torch.from_numpy(far.astype(np.float32)),
+            far_triangle=torch.from_numpy(np.where(np.isfinite(far), hits.triangle[rows, second], -1).astype(np.int64)),
             far_back_facing=torch.from_numpy((in_far_group & hits.back_facing).any(1)),
         )
 

@@ -19,7 +19,7 @@ from rtgs.mesh.guide import RayHits
 from rtgs.mesh.normals import interpolated
 
 OFF_THE_WALL = 1e-4  # of the object's size: a mirrored ray starts so far inside
-CACHED = 512  # cameras whose paths are kept
+CACHED_BYTES = 512 << 20  # of the paths that are kept
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Leg:
     origin: Tensor  # (L, 3) float32 world: where the light was mirrored
     direction: Tensor  # (L, 3) float32 unit
     length: Tensor  # (L,) float32 world units to the next wall; 0 where the mesh has none
-    cosine: Tensor  # (L,) float32 of the angle of incidence there; 1 where there is none
+    cosine: Tensor  # (L,) float32 of the angle of incidence there; 1 where there is no wall, 0 where it is no glass
 
     @property
     def exit(self) -> Tensor:
@@ -50,6 +50,12 @@ class InnerPaths:
     cosine: Tensor  # (K,) float32 of the angle of incidence there
     legs: tuple[Leg, ...]  # the first has K rows; later ones those that the one before goes on to
 
+    @property
+    def bytes(self) -> int:
+        """Of all tensors."""
+        tensors = (self.pixels, self.cosine, *(each for leg in self.legs for each in vars(leg).values()))
+        return sum(each.numel() * each.element_size() for each in tensors)
+
     def take(self, wanted: Tensor) -> tuple[Tensor, InnerPaths]:
         """Of pixels ``wanted`` (R,) int64: (K',) rows of it that have a path, and these paths in that order."""
         place = torch.searchsorted(self.pixels, wanted).clamp_max(max(len(self.pixels) - 1, 0))
@@ -66,7 +72,7 @@ class InnerPaths:
 
 
 class InnerGuide:
-    """The paths of each camera; the last ``CACHED`` cameras are remembered.
+    """The paths of each camera; those of the last cameras are remembered, up to ``CACHED_BYTES``.
 
     ``bounces``: reflections inside the object that are followed, at least 1. ``glass`` (F,) bool: faces that are glass;
     light is mirrored at no others.
@@ -80,15 +86,18 @@ class InnerGuide:
         size = float(np.linalg.norm(mesh.bounds[1] - mesh.bounds[0]))
         self._off, self._nearest = OFF_THE_WALL * size, 0.5 * mesh.voxel
         self._cache: dict[tuple[object, ...], InnerPaths] = {}
+        self._held = 0  # bytes
 
     def paths(self, camera: Camera, guide: ObjectGuide) -> InnerPaths:
         """Behind the pixels of ``camera`` whose far wall is glass; ``guide`` of the same mesh."""
         key = camera_key(camera)
         found = self._cache.pop(key, None)
-        found = self._find(camera, guide.surfaces(camera)) if found is None else found
-        self._cache[key] = found
-        while len(self._cache) > CACHED:
-            del self._cache[next(iter(self._cache))]
+        if found is None:
+            found = self._find(camera, guide.surfaces(camera))
+            self._held += found.bytes
+            while self._cache and self._held > CACHED_BYTES:
+                self._held -= self._cache.pop(next(iter(self._cache))).bytes
+        self._cache[key] = found  # the newest is last
         return found
 
     def _find(self, camera: Camera, surfaces: ObjectSurfaces) -> InnerPaths:
@@ -96,12 +105,9 @@ class InnerGuide:
         rays = camera.rays(torch.float64)
         directions = rays.directions.reshape(-1, 3)[pixels].numpy()
         origins = np.broadcast_to(rays.origin.numpy(), directions.shape).copy()
-        hits = self.mesh.rays.intersect(origins, directions)
-        far = surfaces.far.flatten()[pixels].double().numpy()
-        nearest = np.abs(np.where(np.isfinite(hits.distance), hits.distance, np.inf) - far[:, None]).argmin(1)
-        rows = np.arange(len(pixels))
-        triangle, distance = hits.triangle[rows, nearest], hits.distance[rows, nearest]
-        kept = np.isfinite(distance)
+        pair = self.mesh.rays.along(torch.from_numpy(origins), torch.from_numpy(directions))
+        triangle, distance = pair.far_triangle.numpy(), pair.far.double().numpy()
+        kept = triangle >= 0
         kept[kept] &= self._glass[triangle[kept]]
         points = origins[kept] + distance[kept, None] * directions[kept]
         unit = directions[kept] / np.linalg.norm(directions[kept], axis=1, keepdims=True)
@@ -123,9 +129,10 @@ class InnerGuide:
         inward = np.zeros_like(points)
         inward[there] = self._inward(triangle[there], ends[there], mirrored[there])
         cosine = np.where(there, -(inward * mirrored).sum(1), 1.0)
-        leg = Leg(torch.from_numpy(parent), _float(points), _float(mirrored), _float(length), _float(cosine))
         goes_on = there.copy()
         goes_on[there] &= self._glass[triangle[there]]
+        cosine[there & ~goes_on] = 0.0  # a label or a lid lets nothing through
+        leg = Leg(torch.from_numpy(parent), _float(points), _float(mirrored), _float(length), _float(cosine))
         return leg, ends, mirrored, inward, np.flatnonzero(goes_on)
 
     def _first(self, hits: RayHits) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

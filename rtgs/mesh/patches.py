@@ -27,7 +27,7 @@ class Patch:
     heights: np.ndarray  # (P,) along the normals, world units, for foot and held
 
 
-def unseen_patches(shape: MeshShape, seen: np.ndarray, voxel: float, foot_degrees: float) -> list[Patch]:
+def unseen_patches(shape: MeshShape, seen: np.ndarray, voxel: float, foot_degrees: float, fill: float) -> list[Patch]:
     """The parts that are not ``seen`` (V,). A part whose border is plane, and which the surface meets at an angle of
     ``foot_degrees`` or more, is a foot: things stand on planes."""
     from scipy.sparse.csgraph import connected_components
@@ -45,8 +45,8 @@ def unseen_patches(shape: MeshShape, seen: np.ndarray, voxel: float, foot_degree
         inside[vertices] = True
         rim = shape.grown(inside, _RINGS) & ~inside
         patch = Patch(vertices, rim, "smooth", np.zeros(len(vertices)))
-        if rim.any() and _slope(patch, shape) >= foot_degrees:
-            patch = foot_of(patch, shape, voxel, 3.0)
+        if rim.sum() >= 3 and _slope(patch, shape) >= foot_degrees:
+            patch = foot_of(patch, shape, voxel, fill)
             patch = patch if patch.kind == "foot" else replace(patch, kind="smooth")
         found.append(patch)
     return found

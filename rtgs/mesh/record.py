@@ -40,22 +40,24 @@ class SurfaceFit:
     Attributes:
         iou_before, iou: silhouette IoU of the hull and of the surface with the masks, where nothing hides the object.
         outline_before, outline: pixels between their outlines and those of the masks, root mean square.
+        contradicted: share of the surface's seen area where the outlines are off by more than their noise.
         strength: of smoothing: voxels, median over the vertices.
-        sharp: share of the vertices at which the outlines asked for less smoothing: edges.
+        sharp: of a free surface: share of the vertices at which the outlines asked for less smoothing: edges.
         unseen: share of the vertices that no outline tells of.
-        feet: unseen parts that were made plane.
-        held: unseen parts that stay as the hull has them.
+        feet: of a free surface: unseen parts that were made plane.
+        held: of a free surface: unseen parts that stay as the hull has them.
     """
 
     iou_before: float
     iou: float
     outline_before: float
     outline: float
-    strength: float
-    sharp: float
-    unseen: float
-    feet: int
-    held: int
+    contradicted: float
+    strength: float | None = None
+    sharp: float | None = None
+    unseen: float | None = None
+    feet: int | None = None
+    held: int | None = None
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,7 @@ class MeshRecord:
         source: how the object's mesh was found: ``hull``, ``tsdf``, ``given``; None: a mesh of the scene.
         voxel: side of the grid's cells, world units.
         flat: the object is a pane.
-        surface: how the hull was smoothed: ``free``; None: it was not.
+        surface: how the hull was smoothed: ``free``, ``sphere``, ``revolution``, ``planes``; None: it was not.
         surface_fit: figures of that.
     """
 

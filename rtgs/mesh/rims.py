@@ -46,7 +46,7 @@ def rim_views(views: Sequence[MaskView], hidden: Sequence[Tensor]) -> list[RimVi
         usable = np.zeros(view.mask.shape, bool)
         usable[_BORDER:-_BORDER, _BORDER:-_BORDER] = True
         if behind.any():
-            usable &= ~np.asarray(binary_dilation(behind.numpy(), iterations=_HIDDEN))
+            usable &= np.logical_not(binary_dilation(behind.numpy(), iterations=_HIDDEN))
         found.append(RimView(view.camera, signed_distance((view.mask | behind).numpy()).numpy(), usable))
     return found
 
@@ -105,13 +105,13 @@ def _rims_of_view(shape: MeshShape, view: RimView, index: int, guide: MeshGuide,
     plain = Rims(ends, first / (first - second), np.zeros(len(ends)), np.ones(len(ends)), np.full(len(ends), index))
     points, normal = plain.at(shape.vertices), plain.at(normals)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
-    offset, pixel, good = _outside(view, points, gate)
+    offset, pixel, good = outside(view, points, gate)
     beyond = points + _PAST * pixel[:, None] * normal - centre
     good[good] = ~guide.meets(np.broadcast_to(centre, beyond[good].shape).copy(), beyond[good])
     return Rims(ends[good], plain.share[good], offset[good], pixel[good], plain.view[good])
 
 
-def _outside(view: RimView, points: np.ndarray, gate: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def outside(view: RimView, points: np.ndarray, gate: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(N,) how far inside the mask's outline points lie, world units; (N,) size of a pixel there; (N,) bool: known."""
     from scipy.ndimage import map_coordinates
 

@@ -197,20 +197,18 @@ class _TwoSurfaces:
 
 def _two_surfaces(guide: MeshGuide, corners: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> _TwoSurfaces:
     """The surfaces that a camera's :class:`ObjectGuide` finds, with the normals of both."""
-    hits, rows = guide.intersect(origins, directions), np.arange(len(directions))
-    first, near = hits.triangle[:, 0] >= 0, hits.distance[:, :1]
-    reach = guide.merge_distance / np.linalg.norm(directions, axis=1)
-    beyond = (hits.triangle >= 0) & (hits.distance > near + reach[:, None])
-    column = beyond.argmax(1)
-    second = beyond.any(1) & ~hits.back_facing[:, 0]
+    pair = guide.along(torch.from_numpy(origins), torch.from_numpy(directions))
+    second = pair.has_far & ~pair.near_back_facing
     normals = []
-    for found, index in ((first, np.zeros_like(column)), (second, column)):
+    for found, distance, triangle in (
+        (pair.hit.numpy(), pair.near, pair.near_triangle),
+        (second.numpy(), pair.far, pair.far_triangle),
+    ):
         normal = np.zeros_like(directions)
-        rays = rows[found]
-        points = origins[rays] + hits.distance[rays, index[rays], None] * directions[rays]
-        normal[rays] = interpolated(guide.mesh, corners, hits.triangle[rays, index[rays]], points)
+        points = origins[found] + distance.double().numpy()[found, None] * directions[found]
+        normal[found] = interpolated(guide.mesh, corners, triangle.numpy()[found], points)
         normals.append(normal)
-    return _TwoSurfaces(first, second, hits.distance[rows, column], *normals)
+    return _TwoSurfaces(pair.hit.numpy(), second.numpy(), pair.far.double().numpy(), *normals)
 
 
 def _quantiles(angles: np.ndarray) -> list[float]:

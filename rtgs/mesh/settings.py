@@ -88,12 +88,15 @@ class PaneSettings:
 class SurfaceSettings:
     """How the hull is smoothed; light is mirrored in its normals (decision 62)."""
 
-    fit: Literal["carved", "free"] = "carved"  # free: as smooth as the masks' outlines allow
+    fit: Literal["carved", "free", "auto"] = "auto"
+    """``free``: as smooth as the masks' outlines allow; ``auto``: a sphere, a surface of revolution or a body of planes
+    where they do not contradict it, else free."""
     weakest: float = 1.5  # voxels that the smoothing begins with
     strongest: float = 6.0  # and that it ends with where nothing contradicts
     tolerance: float = 0.1  # pixels that the outlines may be off around a vertex, on the mean
     iou_cost: float = 0.003  # silhouette IoU that the smoothed surface may lose against the hull
     fill: float = 3.0  # voxels that an unseen part may leave the hull
+    contradicted: float = 0.15  # share of its seen area where the outlines may contradict a fitted form
     foot_degrees: float = 30.0  # between an unseen part's plane border and the wall: from here on the part is plane
 
     def __post_init__(self) -> None:
@@ -102,7 +105,7 @@ class SurfaceSettings:
         for name, least in {"weakest": 1.0, "strongest": self.weakest}.items():
             value = getattr(self, name)
             refuse_unless(value >= least, f"mesh.object.surface.{name}", value, f"at least {least:g}")
-        for name, most in {"iou_cost": 1.0, "foot_degrees": 90.0}.items():
+        for name, most in {"iou_cost": 1.0, "contradicted": 1.0, "foot_degrees": 90.0}.items():
             value = getattr(self, name)
             refuse_unless(value <= most, f"mesh.object.surface.{name}", value, f"between 0 and {most:g}")
 

@@ -1,15 +1,23 @@
-"""The surface that light is traced with: the hull smoothed, where its outlines and those of the masks agree on it."""
+"""The surface that light is traced with: what explains the masks' outlines most simply.
+
+A sphere, a surface of revolution, a body of planes, or the hull made as smooth as the outlines allow: the first that
+they do not contradict.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 
 from rtgs.core.decisions import Decision
-from rtgs.mesh.fairing import Fairing, fair_surface
+from rtgs.mesh.ball import fit_ball
+from rtgs.mesh.fairing import contradicted_share, fair_surface
 from rtgs.mesh.hull import HullResult
+from rtgs.mesh.operators import MeshShape
+from rtgs.mesh.polyhedron import fit_planes
 from rtgs.mesh.record import SurfaceFit
-from rtgs.mesh.rims import rim_views
+from rtgs.mesh.revolution import fit_revolution
+from rtgs.mesh.rims import RimView, find_rims, rim_views
 from rtgs.mesh.settings import SurfaceSettings
 from rtgs.mesh.silhouettes import MaskSet, SilhouetteScore
 from rtgs.mesh.triangles import TriangleMesh
@@ -23,30 +31,79 @@ class Surface:
     """What became of the hull."""
 
     mesh: TriangleMesh
-    kind: str  # "free", or empty: the hull stays
+    kind: str  # "sphere", "revolution", "planes", "free", or empty: the hull stays
     fit: SurfaceFit
     decision: Decision
 
 
+@dataclass(frozen=True)
+class _Candidate:
+    mesh: TriangleMesh
+    kind: str
+    said: str  # what it is
+    fit: SurfaceFit  # what is known before it is judged
+    contradicted: float | None = None  # share where the outlines are off; None: by its rims
+
+
+_NOTHING = SurfaceFit(0.0, 0.0, 0.0, 0.0, 0.0)
+
+
 def find_surface(hull: HullResult, masks: MaskSet, settings: SurfaceSettings, score: Score) -> Surface:
-    """The hull smoothed as far as the outlines of the masks allow; the hull itself where that costs silhouette IoU."""
+    """The simplest surface that the masks' outlines do not contradict; the hull itself where none costs little enough
+    silhouette IoU."""
     views = rim_views(masks.views, hull.hidden)
-    found = fair_surface(hull.mesh, hull.voxel, views, settings)
-    before, after = score(hull.mesh).mean, score(found.mesh).mean
-    fit = SurfaceFit(
-        before, after, found.spread_before, found.spread, found.strength, found.sharp, found.unseen, found.feet,
-        found.held,
-    )  # fmt: skip
-    if after < before - settings.iou_cost:
-        why = f"silhouette IoU {after:.4f}, {before:.4f} as carved (mesh.object.surface.iou_cost {settings.iou_cost:g})"
-        return Surface(hull.mesh, "", fit, Decision("hull not smoothed", why))
-    return Surface(found.mesh, "free", fit, Decision("hull smoothed", _why(found, fit)))
+    before = find_rims(MeshShape.of(hull.mesh), views).spread
+    carved = score(hull.mesh).mean
+    refused = []
+    for found in _candidates(hull, views, settings):
+        shape = MeshShape.of(found.mesh)
+        rims = find_rims(shape, views)
+        share = found.contradicted
+        if share is None:
+            share = contradicted_share(shape, rims, hull.voxel, settings.tolerance)
+        cost = settings.iou_cost if found.kind != "planes" else 0.0  # edges alone tell too little of what lies between
+        iou = score(found.mesh).mean
+        fit = replace(
+            found.fit, iou_before=carved, iou=iou, outline_before=before, outline=rims.spread, contradicted=share
+        )
+        if found.kind != "free" and share > settings.contradicted:
+            why = f"outlines contradict it on {100 * share:.0f} % of its area"
+            refused.append(f"{found.said}: {why} (mesh.object.surface.contradicted {settings.contradicted:g})")
+        elif iou < carved - cost:
+            why = f"silhouette IoU {iou:.4f}, {carved:.4f} as carved"
+            refused.append(f"{found.said}: {why} (it may cost {cost:g}, mesh.object.surface.iou_cost)")
+        else:
+            why = "; ".join([f"{found.said}; {_figures(fit)}", *(f"not {text}" for text in refused)])
+            return Surface(found.mesh, found.kind, fit, Decision(f"hull smoothed: {found.kind}", why))
+    return Surface(hull.mesh, "", _NOTHING, Decision("hull not smoothed", "; ".join(refused)))
 
 
-def _why(found: Fairing, fit: SurfaceFit) -> str:
-    said = f"over {found.strength:.1f} voxels, less at {100 * found.sharp:.0f} % of the vertices, where the outlines"
-    said += f" contradict; silhouette IoU {fit.iou:.4f}, {fit.iou_before:.4f} as carved; outlines {fit.outline:.2f} px "
-    said += f"off, {fit.outline_before:.2f} as carved; no outline tells of {100 * found.unseen:.1f} %"
-    parts = [(found.feet, "made plane"), (found.held, "held where the hull is")]
-    said += "".join(f", {count} parts {what}" for count, what in parts if count)
-    return said
+def _candidates(hull: HullResult, views: list[RimView], settings: SurfaceSettings) -> Iterator[_Candidate]:
+    """What is tried, the simplest first."""
+    if settings.fit == "auto":
+        ball = fit_ball(hull.mesh, views)
+        if ball is not None:
+            yield _Candidate(ball.mesh(), "sphere", f"a sphere of radius {ball.radius:.4g}", _NOTHING)
+        turned = fit_revolution(hull.mesh, hull.voxel, views, settings.foot_degrees)
+        if turned is not None:
+            said = f"a surface of revolution, its profile smoothed over {turned.length:g} voxels"
+            fit = replace(_NOTHING, strength=turned.length, unseen=1 - float(turned.seen.mean()))
+            yield _Candidate(turned.mesh(), "revolution", said, fit)
+        flat = fit_planes(hull.mesh, hull.voxel, views, settings.tolerance)
+        if flat is not None:
+            said = f"a body of {len(flat.body.normals)} planes"
+            yield _Candidate(flat.body.mesh(hull.voxel), "planes", said, _NOTHING, flat.contradicted)
+    free = fair_surface(hull.mesh, hull.voxel, views, settings)
+    said = f"smoothed over {free.strength:.1f} voxels, less at {100 * free.sharp:.0f} % of the vertices, where the "
+    said += f"outlines contradict; no outline tells of {100 * free.unseen:.1f} %"
+    parts = [(free.feet, "made plane"), (free.held, "held where the hull is")]
+    said += "".join(f", {count} part{'s' if count > 1 else ''} {what}" for count, what in parts if count)
+    fit = replace(
+        _NOTHING, strength=free.strength, sharp=free.sharp, unseen=free.unseen, feet=free.feet, held=free.held
+    )
+    yield _Candidate(free.mesh, "free", said, fit)
+
+
+def _figures(fit: SurfaceFit) -> str:
+    iou = f"silhouette IoU {fit.iou:.4f}, {fit.iou_before:.4f} as carved"
+    return f"{iou}; outlines {fit.outline:.2f} px off, {fit.outline_before:.2f} as carved"

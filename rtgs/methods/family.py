@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from rtgs.methods.plans import reflection_plan, transmittance_plan
-from rtgs.methods.reads import diffuse_alone, without_transmittance
+from rtgs.methods.reads import as_lit, diffuse_alone, without_transmittance
 from rtgs.methods.spec import StageSpec
 
 if TYPE_CHECKING:
@@ -37,6 +37,7 @@ TRANSMITTANCE = StageSpec(
     "transmittance",
     _transmittance_start,
     "method.transmittance.start",
+    reads=as_lit,
     on=_transmittance_on,
     on_key="method.transmittance.enabled",
     needs_object=True,

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from rtgs.gaussians.settings import MaterialSettings, OptimizerSettings
 from rtgs.methods.settings import InterfaceSettings, MethodSettings, ReflectionSettings, TransmittanceSettings
-from rtgs.optics.settings import OpticsSettings
+from rtgs.optics.settings import OpticsSettings, WallSettings
 from rtgs.train.settings import LossSettings
 
 _SECOND_STAGE_LOSSES = ("perceptual", "specular")
@@ -40,6 +40,13 @@ def without_transmittance(settings: MethodSettings) -> MethodSettings:
     # The start stays where L_spec is read, so that this function finds the same when it is asked again.
     kept = replace(_UNREAD, enabled=True, start=settings.transmittance.start) if masks else _UNREAD
     return replace(settings, transmittance=kept, loss=_without_losses(settings.loss, unread))
+
+
+def as_lit(settings: MethodSettings) -> MethodSettings:
+    """Nothing of the walls where their weights are learned."""
+    if settings.transmittance.wall.light == "fresnel":
+        return settings
+    return replace(settings, transmittance=replace(settings.transmittance, wall=WallSettings()))
 
 
 def _without_losses(loss: LossSettings, prefixes: tuple[str, ...]) -> LossSettings:

@@ -198,7 +198,7 @@ class TransmittanceSettings:
     compositing: Literal["over", "sum"] = "over"  # decision 12: C_1 + (1 - A_1) C_2; "sum": C_1 + C_2
     # Where the object's pixels have their surface; the paper: "base", the rasterised depth.
     first_surface: Literal["mesh", "base"] = "mesh"
-    # The rasterised normals there (of the interface, if there is one); "mesh": fixed, for tests.
+    # The rasterised normals there (of the interface, if there is one); "mesh": those of the mesh, which stay.
     normal: Literal["base", "mesh"] = "base"
     # S_max in the object's pixels, whose f0 stays low; None: optics.max_gain. w_r is bounded by max_weight.
     max_gain: float | None = 16.0

@@ -90,8 +90,9 @@ class LossTable:
 
     def evaluate(self, rendered: RenderedView, view: View, step: int) -> LossValues:
         """The weighted sum of what acts at ``step``."""
-        image = as_the_sensor(rendered.image, view.image) if self.clipped else rendered.image
-        photometric = photometric_loss(image, view.image, self.l1, self.dssim)
+        if self.clipped:
+            rendered = replace(rendered, image=as_the_sensor(rendered.image, view.image))
+        photometric = photometric_loss(rendered.image, view.image, self.l1, self.dssim)
         first = (LossValue("l1", photometric.l1, self.l1), LossValue("dssim", photometric.dssim, self.dssim))
         found = LossValues(photometric.total, first)
         for term in self.terms:

@@ -2,11 +2,13 @@
 
 from pathlib import Path
 
+import pytest
 import torch
 
 from lab import fusion
 
 
+@pytest.mark.slow
 def test_every_fusion_finds_the_container(tmp_path: Path):
     figures = fusion.measure("ball_statue", list(fusion.WAYS), tmp_path, 96)
     found = {(row["way"], row["depths"]): row["distance"] for row in figures}

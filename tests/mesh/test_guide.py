@@ -3,14 +3,15 @@
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from rtgs.mesh.guide import MeshGuide
 from rtgs.mesh.triangles import TriangleMesh
 from tests.mesh.shapes import box, box_depths, camera_at, join, sphere, sphere_depths
 
-LOW, HIGH = (-0.5, -0.4, -0.3), (0.6, 0.7, 0.8)
+# as a mesh holds them: half a float32's rounding of a corner is a hundred of them along a grazing ray
+LOW, HIGH = (tuple(np.float32(values).tolist()) for values in ((-0.5, -0.4, -0.3), (0.6, 0.7, 0.8)))
 
 
 def agree(ours: torch.Tensor, exact: torch.Tensor, tolerance: float) -> None:
@@ -20,6 +21,7 @@ def agree(ours: torch.Tensor, exact: torch.Tensor, tolerance: float) -> None:
 
 
 @given(angle=st.floats(0, 6.28), height=st.floats(-2, 2))
+@example(angle=1.3671875, height=1.0)  # along a side
 @settings(max_examples=15, deadline=None)
 def test_box_from_anywhere_is_exact(angle: float, height: float) -> None:
     camera = camera_at((3 * np.cos(angle), 3 * np.sin(angle), height))
@@ -28,8 +30,8 @@ def test_box_from_anywhere_is_exact(angle: float, height: float) -> None:
     thick = (far - near > 1e-3) | torch.isinf(near)  # through an edge the box is thinner than the merge distance
     thick &= ~torch.isnan(near)
     assert thick.float().mean() > 0.98
-    agree(pair.near[thick], near[thick], 1e-5)  # float32 distances of about 3, at grazing angles too
-    agree(pair.far[thick], far[thick], 1e-5)
+    agree(pair.near[thick], near[thick], 1e-6)  # float32 distances of about 3, at grazing angles too
+    agree(pair.far[thick], far[thick], 1e-6)
     inside = pair.hit & thick
     assert not pair.near_back_facing[inside].any()
     assert pair.far_back_facing[inside].all()

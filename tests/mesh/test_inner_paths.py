@@ -8,6 +8,7 @@ import torch
 from shapes import box, sphere
 
 from rtgs.core.cameras import Camera
+from rtgs.mesh import inner_paths
 from rtgs.mesh.container import ObjectGuide, ObjectMesh
 from rtgs.mesh.inner_paths import InnerGuide, InnerPaths
 
@@ -96,6 +97,7 @@ def test_no_light_is_mirrored_where_the_mesh_is_no_glass(ball: ObjectMesh):
     goes_on = torch.zeros(len(ends), dtype=torch.bool).index_fill(0, left.legs[1].parent, True)
     assert bool((ends[goes_on] < 0.02).all())
     assert bool((ends[~goes_on] > -0.02).all())
+    assert bool((left.legs[0].cosine[~goes_on] == 0).all()), "what is no glass lets nothing through"
     assert 0 < int(goes_on.sum()) < len(ends)
 
 
@@ -107,6 +109,24 @@ def test_a_camera_is_looked_up_once_and_no_bounce_is_refused(ball: ObjectMesh, m
     assert paths.paths(camera(), guide) is first
     with pytest.raises(ValueError, match="bounces is 0"):
         InnerGuide(ball, every, 0)
+
+
+def test_the_oldest_cameras_go_when_the_paths_take_too_much(ball: ObjectMesh, monkeypatch: pytest.MonkeyPatch):
+    every = torch.ones(len(ball.mesh.faces), dtype=torch.bool)
+    paths, guide = InnerGuide(ball, every, 1), ObjectGuide(ball)
+    cameras = [camera(width) for width in (24, 26, 28)]
+    one = paths.paths(cameras[0], guide).bytes
+    monkeypatch.setattr(inner_paths, "CACHED_BYTES", 2 * one + one // 2)
+    kept = [paths.paths(each, guide) for each in cameras]
+    found = []
+    real = ball.rays.along
+    monkeypatch.setattr(ball.rays, "along", lambda *given: found.append(given) or real(*given))
+    assert paths.paths(cameras[2], guide) is kept[2]
+    assert paths.paths(cameras[1], guide) is kept[1]
+    assert not found
+    assert paths.paths(cameras[0], guide) is not kept[0]
+    assert paths.paths(cameras[1], guide) is kept[1], "used last but one: the third has gone"
+    assert paths.paths(cameras[2], guide) is not kept[2]
 
 
 def test_a_leg_that_finds_no_wall_has_no_length():

@@ -11,7 +11,7 @@ import pytest
 
 from rtgs.core.decisions import Decision
 from rtgs.core.errors import RtgsError
-from rtgs.mesh.record import MeshRecord, MeshTruth
+from rtgs.mesh.record import MeshRecord, MeshTruth, SurfaceFit
 
 SCENE = MeshRecord(note="Voxel 0.1.", picture_from="a.png", depth_trunc=3.0, pieces_found=2, pieces_kept=1, voxel=0.1)
 OBJECT = MeshRecord(
@@ -26,6 +26,8 @@ OBJECT = MeshRecord(
     source="hull",
     voxel=0.02,
     flat=False,
+    surface="free",
+    surface_fit=SurfaceFit(0.99, 0.995, 0.4, 0.3, 0.05, strength=1.5, sharp=0.2, unseen=0.0, feet=1, held=0),
     vertices=8,
     faces=12,
 )

@@ -17,7 +17,7 @@ from rtgs.core.cameras import Camera
 from rtgs.mesh.container import ObjectGuide, ObjectSurfaces
 from rtgs.methods import Mode, RenderOptions, Stage
 from rtgs.methods.model import Model
-from rtgs.methods.parts.glass_evidence import glass_faces, on_surface, seen_bare
+from rtgs.methods.parts.glass_evidence import glass_faces, near_surface, on_surface, seen_bare
 from rtgs.methods.parts.interface_set import normal_quaternions
 from rtgs.methods.shading.mirror import SurfacePixels
 from rtgs.methods.shading.straight import glass_pixels, widened
@@ -139,12 +139,45 @@ def test_what_is_seen_bare_stays_in_the_base_set_too(capped: GlassScene):
     train_stages(new_glass_method(recipe, capped, schedule(total=24, checkpoint_every=100)), capped.scene)
 
 
+def test_points_near_a_surface_are_told_by_their_pixel(plain: GlassScene):
+    camera = plain.scene.train[0].camera
+    depth = torch.full((camera.height, camera.width), 2.0)
+    along = camera.rays().directions.reshape(-1, 3)[::97]
+    center = camera.center.float()
+    for z, near in ((2.04, True), (1.96, True), (2.06, False), (1.0, False)):
+        assert bool((near_surface(center + z * along, camera, depth, 0.05) == near).all())
+    assert not near_surface(center - along, camera, depth, 10.0).any(), "behind the camera"
+
+
+def test_the_weight_of_some_gaussians_is_their_share_of_the_coverage(plain: GlassScene):
+    method = new_glass_method(glass_recipe(), plain)
+    camera = plain.scene.train[0].camera
+    chosen = torch.arange(len(method["base"])) % 3 == 0
+    base = method.base
+    some, every = base.weight_of(chosen, camera, 10)
+    others, _ = base.weight_of(~chosen, camera, 10)
+    torch.testing.assert_close(some + others, every, atol=1e-5, rtol=1e-4)
+    assert 0.1 < float(some.sum() / every.sum()) < 0.6
+
+
 def test_an_opaque_thing_under_masks_is_left_alone(plain: GlassScene):
     guide = ObjectGuide(plain.mesh)
     views = plain.scene.train
-    assert on_surface(guide, views, ball_depth) == pytest.approx(1.0, abs=0.05)
-    assert on_surface(guide, views, lambda camera: ball_depth(camera) + RADIUS) == pytest.approx(0.0, abs=0.05)
-    assert on_surface(guide, [replace(view, mask=None) for view in views], ball_depth) is None
+
+    def painted(share: float):
+        """On the ball's surface so much of what a pixel shows, behind it the rest."""
+
+        def weights(camera: Camera, depth: Tensor, reach: float) -> tuple[Tensor, Tensor]:
+            assert 0 < reach < RADIUS
+            true = ball_depth(camera)
+            assert float((depth - true)[true > 0].abs().median()) < 0.1 * RADIUS
+            return torch.where(true > 0, 0.9 * share, 0.0), torch.full_like(depth, 0.9)
+
+        return weights
+
+    for share in (1.0, 0.6, 0.0):
+        assert on_surface(guide, views, painted(share)) == pytest.approx(share, abs=0.05)
+    assert on_surface(guide, [replace(view, mask=None) for view in views], painted(1.0)) is None
     method = _with_skin(plain)
     (event,) = method.begin(method.stages[2])
     assert "left out: the masked object looks opaque" in event.detail

@@ -14,6 +14,7 @@ from rtgs.core.errors import RtgsError
 from rtgs.mesh.inner_paths import InnerPaths, Leg
 from rtgs.methods import Mode, RenderOptions
 from rtgs.methods.model import Model
+from rtgs.methods.parts.glass import Glass
 from rtgs.methods.settings import MethodSettings
 from rtgs.methods.shading.inner import TracedLeg, far_wall, inner_light
 from rtgs.optics.dielectric import wall_reflectance
@@ -122,20 +123,55 @@ def test_the_layers_add_up_in_linear_light(made: GlassScene):
     torch.testing.assert_close(found.image, image, atol=1e-4, rtol=1e-3)
 
 
+def test_the_weight_map_is_what_was_composited(made: GlassScene):
+    """L_spec reads k_s as the Gaussians have it, not the cover that the walls make of it."""
+    method = begun(fresnel(cover=0.5), made)
+    with torch.no_grad():
+        for name in ("base", "interface"):
+            method[name].gaussians["specular_logits"].fill_(-1.0)
+    found = shown(method, made)
+    assert found.layers is not None
+    inside = found.maps["transparent"]
+    raw, shaded = found.maps["specular"][inside], found.layers["specular"][inside]
+    assert float(raw.max()) <= float(torch.tensor(-1.0).sigmoid()) + 1e-5
+    torch.testing.assert_close(shaded.median(), (raw / 0.5).median(), atol=1e-4, rtol=1e-3)
+
+
+def test_dark_contents_take_their_own_light_and_no_other(made: GlassScene):
+    """Behind a half transparent black ball everything else is dimmed, and nothing is counted as the ball's."""
+    method = begun(fresnel(), made)
+    contents = method["transmittance"].gaussians
+    with torch.no_grad():
+        contents.sh_dc.fill_(-0.5 / 0.28209479)
+        contents.sh_rest.zero_()
+        contents.opacity_logits.fill_(0.0)
+    found = shown(method, made)
+    assert found.layers is not None
+    light = {name: decoded(found.layers[name], "linear") for name in ("inner", "contents", "behind", "transmission")}
+    assert float(light["contents"].max()) < 1e-4
+    torch.testing.assert_close(light["inner"] + light["behind"], light["transmission"], atol=1e-4, rtol=1e-3)
+    assert float(light["behind"].max()) > 0.01
+
+
 def test_without_inner_bounces_no_light_is_mirrored_inside(made: GlassScene):
     found = shown(begun(fresnel(bounces=0), made), made)
     assert found.layers is not None
-    assert "inner" not in found.layers
+    assert float(found.layers["inner"].abs().max()) == 0
+    assert float(found.layers["behind"].max()) > 0
     assert "transmission" in found.layers
 
 
-@pytest.mark.parametrize("first", ["base", "none"])
-def test_without_a_transmittance_set_no_light_is_followed_inside(made: GlassScene, first: str):
+@pytest.mark.parametrize("off", [{"first_bounce": "base"}, {"first_bounce": "none"}, {"second_bounce": "none"}])
+def test_without_contents_or_a_far_wall_no_light_is_followed_inside(made: GlassScene, off: dict):
     settings = fresnel(bounces=2)
-    settings = replace(settings, transmittance=replace(settings.transmittance, first_bounce=first))
-    found = shown(begun(settings, made), made)
+    method = begun(replace(settings, transmittance=replace(settings.transmittance, **off)), made)
+    part = method.parts["glass"]
+    assert isinstance(part, Glass)
+    assert part.wall is not None
+    assert part.wall.settings.bounces == 0
+    found = shown(method, made)
     assert found.layers is not None
-    assert "inner" not in found.layers
+    assert "inner" not in found.layers or float(found.layers["inner"].abs().max()) == 0
     assert bool(torch.isfinite(found.image).all())
 
 

@@ -225,7 +225,7 @@ def test_density_control_and_resets_happen_as_scheduled_and_are_told():
     events = {step: train_step(method, scene, step)[1] for step in range(41)}
     kinds = {step + 1: [event.kind for event in found] for step, found in events.items() if found}
     assert kinds == {20: ["density"], 30: ["opacity_reset"], 40: ["density"]}
-    assert "surfels" in events[19][0].detail
+    assert "Gaussians" in events[19][0].detail
     method, scene = make(densify_until=45, opacity_reset_every=30)
     for step in range(30):
         train_step(method, scene, step)

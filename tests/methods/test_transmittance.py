@@ -18,6 +18,7 @@ from rtgs.mesh.triangles import TriangleMesh
 from rtgs.methods import Mode, RenderOptions, Stage, create_method, find_method
 from rtgs.methods.parts.transmittance_init import random_surfels
 from rtgs.methods.settings import InterfaceSettings, MethodSettings, TransmittanceSettings
+from rtgs.optics.settings import WallSettings
 from rtgs.train.seeds import generator_for
 from rtgs.train.trainer import Trainer
 
@@ -359,6 +360,12 @@ def test_what_an_earlier_stage_does_not_read_is_blank():
         assert stage_settings(once, stage) == once
         assert stage_settings(stage_settings(other, "reflection"), "diffuse") == stage_settings(other, "diffuse")
     assert stage_settings(other, "transmittance") == other
+    walled = replace(plain.transmittance, wall=WallSettings(bounces=3, cover=0.5))
+    unlit = replace(plain, transmittance=walled)
+    assert stage_settings(unlit, "transmittance") == plain, "walls whose light is learned read nothing of them"
+    linear = replace(plain.optics, blend="linear")
+    lit = replace(plain, optics=linear, transmittance=replace(walled, wall=replace(walled.wall, light="fresnel")))
+    assert stage_settings(lit, "transmittance") == lit
     early = replace(plain, loss=replace(plain.loss, specular=0.2, specular_start=0.05))
     assert stage_settings(early, "reflection").loss.specular == 0.2
     assert stage_settings(stage_settings(early, "reflection"), "reflection") == stage_settings(early, "reflection")

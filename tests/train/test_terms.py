@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -35,6 +36,23 @@ def test_the_total_is_the_weighted_sum_of_what_acts():
         assert float(found.total.detach()) == pytest.approx(expected, rel=1e-5)
     (gradient,) = torch.autograd.grad(after.total - before.total, shown.image)
     assert torch.allclose(gradient, torch.full_like(gradient, 1.0 / gradient.numel()))  # 3 - 2, of the mean
+
+
+def test_what_a_photo_cannot_show_is_no_error_of_any_term():
+    shown, view = rendered(1.7)
+    view = replace(view, image=torch.ones_like(view.image))
+    table = LossTable(0.8, 0.2, (term("bright"),))
+    plain, clipped = (replace(table, clipped=on).evaluate(shown, view, 0) for on in (False, True))
+    found = {value.name: value.value for value in clipped.terms}
+    assert found["l1"] == pytest.approx(0, abs=1e-6)
+    assert found["dssim"] == pytest.approx(0, abs=1e-5)
+    assert found["bright"] == pytest.approx(1)
+    (gradient,) = torch.autograd.grad(clipped.total, shown.image)
+    assert not gradient.any()
+    assert {value.name: value.value for value in plain.terms}["bright"] == pytest.approx(1.7)
+    assert float(plain.total.detach()) > float(clipped.total.detach()) + 0.5
+    dark = replace(view, image=torch.full_like(view.image, 0.5))
+    assert torch.equal(*(replace(table, clipped=on).evaluate(shown, dark, 0).total for on in (False, True)))
 
 
 def test_only_maps_of_terms_that_act_are_asked_for():

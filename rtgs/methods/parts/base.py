@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Protocol
 import torch
 from torch import Tensor
 
+from rtgs.core.cameras import Camera
 from rtgs.core.decisions import Decision
 from rtgs.gaussians.initialize import gaussians_from_points
 from rtgs.gaussians.normals import NORMAL_RESIDUAL
@@ -132,6 +133,15 @@ class BaseSet(Part):
         if probe is None or buffers.weight_sum is None:
             return Raster(buffers)
         return Raster(buffers, (Observation(self.name, probe, buffers.weight_sum[: len(self.set)]),))
+
+    @torch.no_grad()
+    def weight_of(self, chosen: Tensor, camera: Camera, step: int) -> tuple[Tensor, Tensor]:
+        """(H, W) weight with which the Gaussians ``chosen`` (N,) bool are composited, and that of all of them."""
+        rows = self.set.activated(camera.center.float(), self.sh_degree(step))
+        features = chosen.float()[:, None].expand(-1, 3).contiguous()
+        plain = RasterRequest(camera, RenderOptions(), False, None, torch.zeros(3), self.settings.render, self.extent)
+        buffers = self.kind.rasterize(rows, features, plain)
+        return buffers.features[0], buffers.alpha
 
     def _normal_residual(self, more: int) -> Tensor | None:
         """That of the set's channel, and 0 for ``more`` rows behind it."""

@@ -18,7 +18,7 @@ from rtgs.mesh.container import ObjectGuide, ObjectMesh, ObjectSurfaces
 from rtgs.mesh.silhouettes import bounding
 from rtgs.methods.parts.base import BaseSet, composited
 from rtgs.methods.parts.gaussian_set import GaussianSet, densified, opacity_reset
-from rtgs.methods.parts.glass_evidence import glass_faces, has_masks, on_surface, seen_bare
+from rtgs.methods.parts.glass_evidence import glass_faces, has_masks, near_surface, on_surface, seen_bare
 from rtgs.methods.parts.glass_sets import drawn_in_box, interface_set, taken_from_base, transmittance_set
 from rtgs.methods.parts.interface_set import InterfaceSet, interface_surfels
 from rtgs.methods.parts.mirror import Mirror, Reflected, stored_surfels
@@ -115,8 +115,7 @@ class Glass(Part):
             return ()
         why = "the masks of the training views are empty, or cover all of them"
         if self._left_out != NOT_MASKED:
-            share = f"{self._left_out:.1%} of its pixels"
-            why = f"the masked object looks opaque: in {share} the photos show its own surface "
+            why = f"the masked object looks opaque: {self._left_out:.1%} of what its pixels show is its own surface "
             why += "(method.transmittance.opaque_share)"
         return (Decision("no transmittance stage", why),)
 
@@ -151,8 +150,9 @@ class Glass(Part):
         """Walls that reflect as thin glass does, where the settings ask for them."""
         assert self.guide is not None
         walls = self.settings.transmittance.wall
-        if self.settings.transmittance.first_bounce != "transmittance":
-            walls = replace(walls, bounces=0)  # light mirrored inside is followed through the set that is missing
+        transmittance = self.settings.transmittance
+        if transmittance.first_bounce != "transmittance" or transmittance.second_bounce == "none":
+            walls = replace(walls, bounces=0)  # the set that it would be followed through, or the far wall, is missing
         self.wall = WallLight(walls, self.guide, self._glass) if walls.light == "fresnel" else None
 
     def _add_interface(self, mesh: ObjectMesh) -> StepEvent:
@@ -173,7 +173,12 @@ class Glass(Part):
         assert self.guide is not None
         if border >= 1 or self.guide.mesh.source == "tsdf":  # that mesh is what the photos show, whatever it is
             return None
-        share = on_surface(self.guide, self._views, lambda camera: self._opaque(camera, step))
+
+        def weights(camera: Camera, depth: Tensor, reach: float) -> tuple[Tensor, Tensor]:
+            means = self.base.set.gaussians.means.detach()
+            return self.base.weight_of(near_surface(means, camera, depth, reach), camera, step)
+
+        share = on_surface(self.guide, self._views, weights)
         return share if share is not None and share > border else None
 
     def _leave_out(self, share: float) -> None:
@@ -221,8 +226,9 @@ class Glass(Part):
         """What the mirror shows, and in transparent objects what straight rays meet."""
         if not self.begun or self.settings.transmittance.first_bounce == "none":
             return None
-        mirror, rays = self.mirror, frame.rays
-        glass = self.pixels(frame, mirror.surface(raster.buffers))
+        mirror, rays, shape = self.mirror, frame.rays, (frame.camera.height, frame.camera.width)
+        flat = mirror.surface(raster.buffers)
+        glass = self.pixels(frame, flat)
         chosen = mirror.choose(frame, raster.buffers, glass.flat, always=glass.inside)
         straight = glass_rays(glass, chosen.index, rays.center, rays.directions)
         inner = None
@@ -237,7 +243,7 @@ class Glass(Part):
             chosen,
             met.pixels,
             (met.light(reflection), through),
-            {"transparent": glass.inside.reshape(frame.camera.height, frame.camera.width)},
+            {"transparent": glass.inside.reshape(shape), "specular": flat.specular.reshape(shape)},
             passed.first_bounce,
             (*met.observations, *passed.observations),
         )
@@ -271,7 +277,7 @@ class Glass(Part):
             first_surface=settings.first_surface,
             normal=settings.normal,
         )
-        return made if self.wall is None else self.wall.on_glass(made, made.known)
+        return made if self.wall is None else self.wall.on_glass(made)
 
     def on_glass(self, surfaces: ObjectSurfaces) -> Tensor:
         """(H, W) bool: the mesh's first surface is one of the object's, not a lid or a label."""
@@ -303,9 +309,8 @@ class Glass(Part):
             frame.training and self._depth_loss_on(frame.step),
             frame.training and own is not None and self._watching(own, frame.step),
         )
-        if inner is None or surroundings is None or self.wall is None:
-            return straight.transmit(frame, rays)
-        return straight.transmit(frame, rays, FarWall(inner, surroundings, self.wall.index))
+        wall = None if self.wall is None else FarWall(inner, surroundings, self.wall.index)
+        return straight.transmit(frame, rays, wall)
 
     def _own_degree(self, step: int) -> int:
         """SH degree of the transmittance set: grown on its own clock, but never below what it came with."""

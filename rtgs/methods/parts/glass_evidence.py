@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 
 Depths = Callable[[Camera], Tensor]
 """From a camera to the (H, W) z-depth of what is opaque there, 0 where nothing is."""
+SurfaceWeights = Callable[[Camera, Tensor, float], tuple[Tensor, Tensor]]
+"""From a camera, the (H, W) z-depth of a surface and a distance: the (H, W) weight of what lies so near to the surface
+in the pixel, and that of all that is in the pixel."""
 
 _ON_SURFACE = 0.02  # of the depth: a surfel so near to a pixel's depth is what the pixel shows
 _AT_FRONT = 0.15  # of the view's median thickness: what lies deeper is seen through the surface
@@ -81,16 +84,22 @@ def _pixels(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return torch.where(framed, row * camera.width + column, 0.0).long(), depth.float(), framed
 
 
-def on_surface(guide: ObjectGuide, views: Iterable[View], depths: Depths) -> float | None:
-    """Share of the masked pixels with two surfaces whose opaque surface is the object's first one: near 1 for an opaque
-    thing, which has nothing behind its surface. None: no such pixel."""
-    on = count = 0
+def on_surface(guide: ObjectGuide, views: Iterable[View], weights: SurfaceWeights) -> float | None:
+    """Share of what the masked pixels with two surfaces show that lies on the object's first one: near 1 for an opaque
+    thing, which shows nothing behind its surface. None: no such pixel."""
+    on = count = 0.0
     for view, mask in masked_views(views):
         surfaces = guide.surfaces(view.camera)
         chosen = mask & surfaces.second
         if not chosen.any():
             continue
-        near, far = surfaces.near[chosen], surfaces.far[chosen]
-        on += int(((depths(view.camera)[chosen] - near).abs() < _AT_FRONT * (far - near).median()).sum())
-        count += len(near)
+        thickness = float((surfaces.far[chosen] - surfaces.near[chosen]).median())
+        there, every = weights(view.camera, surfaces.near, _AT_FRONT * thickness)
+        on, count = on + float(there[chosen].sum()), count + float(every[chosen].sum())
     return on / count if count else None
+
+
+def near_surface(points: Tensor, camera: Camera, depth: Tensor, reach: float) -> Tensor:
+    """(N,) bool: points (N, 3) that lie within ``reach`` of the surface (H, W) z-depth of the pixel they are in."""
+    index, z, framed = _pixels(camera, points)
+    return framed & ((z - depth.reshape(-1)[index]).abs() < reach)

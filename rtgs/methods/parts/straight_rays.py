@@ -25,9 +25,25 @@ from rtgs.train.method import Observation
 class FarWall:
     """The wall behind the contents, where it is mirrored light's turning point."""
 
-    inner: InnerRays
-    surroundings: Tensor  # (M, 3) encoded colours that the leaving rays met
+    inner: InnerRays | None  # None: no ray of this view is mirrored there
+    surroundings: Tensor | None  # (M, 3) encoded colours that the leaving rays met
     index: Tensor | float  # of refraction
+
+
+@torch.no_grad()
+def _parts(contents: Tensor, color: Tensor, passing: Tensor, sent: Tensor, wall: FarWall) -> dict[str, Tensor]:
+    """(R, 3) linear light each, whose sum is that of ``color``: of the contents, and the rest by what the wall sends.
+
+    Contents are composited in the photos' encoding, so only shares of the rest are known: those of the light sent.
+    """
+    own = decoded(contents, LINEAR)
+    rest = (decoded(color, LINEAR) - own).clamp_min(0)
+    through = passing
+    if wall.inner is not None:
+        none = torch.zeros(len(wall.inner.rows), 3)
+        through = far_wall(passing, none, wall.inner.rows, wall.inner.paths.cosine, wall.index)
+    behind = rest * (through / sent.clamp_min(1e-9)).clamp(0, 1)
+    return {"contents": own, "behind": behind, "inner": rest - behind}
 
 
 def _of_pixels(rays: GlassRays, values: Tensor) -> Tensor:
@@ -66,37 +82,30 @@ class StraightRays:
         color, parts = first.colors, {}
         if self.settings.transmittance.second_bounce != "none" and not self.mesh.flat:
             rows, behind = self._behind(rays, first, degree)
-            left = 1 - first.alpha
-            if wall is not None:
-                color, parts = self._over_wall(first, left, rows, behind, wall)
-            elif self.settings.transmittance.compositing == "over":
-                color = color.index_add(0, rows, left[rows, None] * behind)
+            shown = (1 - first.alpha)[:, None] if self.settings.transmittance.compositing == "over" else None
+            if wall is None:
+                color = color.index_add(0, rows, behind if shown is None else shown[rows] * behind)
             else:
-                color = color.index_add(0, rows, behind)
-        if not frame.options.layers:
-            parts = {}
+                passing = decoded(torch.zeros_like(color).index_add(0, rows, behind), LINEAR)
+                sent = self._sent(passing, wall)
+                color = color + (1.0 if shown is None else shown) * encoded(sent, LINEAR)
+                parts = _parts(first.colors, color, passing, sent, wall) if frame.options.layers else {}
         full, *lights = (_of_pixels(rays, each) for each in (color, *parts.values()))
         depths = self._depths(rays, first) if self.measured else None
         return Transmission(full, depths, observations, dict(zip(parts, lights, strict=True)))
 
-    def _over_wall(
-        self, first: TraceBuffers, left: Tensor, rows: Tensor, behind: Tensor, wall: FarWall
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        """(R, 3) the first bounce's colour over what the far wall passes and mirrors; and these parts of its light."""
-        assert first.colors is not None
-        passing = decoded(torch.zeros_like(first.colors).index_add(0, rows, behind), LINEAR)
+    def _sent(self, passing: Tensor, wall: FarWall) -> Tensor:
+        """(R, 3) linear light that the far wall sends on: ``passing`` light, less what it reflects, and mirrored."""
+        if wall.inner is None:
+            return passing
         arriving = inner_light(wall.inner.paths, self._legs(wall), wall.index)
-        mirrored = far_wall(passing, arriving, wall.inner.rows, wall.inner.paths.cosine, wall.index)
-        color = first.colors + left[:, None] * encoded(mirrored, LINEAR)
-        with torch.no_grad():
-            through = far_wall(passing, 0 * arriving, wall.inner.rows, wall.inner.paths.cosine, wall.index)
-            parts = {"inner": left[:, None] * (mirrored - through), "behind": left[:, None] * through}
-            parts["contents"] = (decoded(color, LINEAR) - parts["inner"] - parts["behind"]).clamp_min(0)
-        return color, parts
+        return far_wall(passing, arriving, wall.inner.rows, wall.inner.paths.cosine, wall.index)
 
     def _legs(self, wall: FarWall) -> list[TracedLeg]:
         """What was traced along the legs inside the object: its contents, and what the leaving rays met."""
         assert self.own is not None
+        assert wall.inner is not None
+        assert wall.surroundings is not None
         legs = wall.inner.paths.legs
         origins, directions, lengths = (
             torch.cat([getattr(leg, name) for leg in legs]) for name in ("origin", "direction", "length")

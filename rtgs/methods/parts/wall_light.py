@@ -58,11 +58,11 @@ class WallLight:
         """Of refraction: a number, or (1,) with its graph."""
         return self.settings.index if self.group is None else self.group["index"]
 
-    def on_glass(self, glass: GlassPixels, known: Tensor) -> GlassPixels:
-        """The pixels ``known`` (H * W,) bool, whose first surface is glass, with all of their k_s: 1 where nothing else
-        covers them."""
+    def on_glass(self, glass: GlassPixels) -> GlassPixels:
+        """The pixels whose first surface is known to be glass, with all of their k_s: 1 where nothing else covers
+        them."""
         specular = (glass.flat.specular / self.settings.cover).clamp_max(1)
-        specular = torch.where(known & glass.inside, specular, glass.flat.specular)
+        specular = torch.where(glass.known, specular, glass.flat.specular)
         return replace(glass, flat=replace(glass.flat, specular=specular))
 
     def weights(self, reflection: Tensor, cosine: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:

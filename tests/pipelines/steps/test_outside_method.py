@@ -99,6 +99,12 @@ def test_its_settings_are_checked_before_anything_runs(capture: Path, on_path): 
         build_graph(*compose([*words, f"+method.own.rate={rate}"])).training[0].fingerprint for rate in (0.01, 0.02)
     )
     assert slow != fast
+    plain, stated, whole = (
+        build_graph(*compose([*words, *more])).training[0].fingerprint
+        for more in ((), ("+method.own.near_one=0.1",), ("+method.own.rate=1",))
+    )
+    assert stated == plain, "a default that is stated"
+    assert whole == build_graph(*compose([*words, "+method.own.rate=1.0"])).training[0].fingerprint
 
 
 def test_a_change_of_its_module_trains_again(capture: Path, tmp_path: Path, monkeypatch):  # noqa: F811

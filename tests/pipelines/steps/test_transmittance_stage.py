@@ -33,6 +33,7 @@ TINY = (
     "method.reflection.cells=3",
     "method.transmittance.cells=3",
     "method.transmittance.interface.count=200",
+    "mesh.object.hull.voxels=32",
     "method.loss.perceptual=0",
     "evaluation.lpips=false",
 )
