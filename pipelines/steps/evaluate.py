@@ -26,6 +26,7 @@ TRACKED = (  # means over the test views that go to the tracker, where they are 
     *("psnr_reflection", "psnr_reflection_scaled", "psnr_transmission", "psnr_transmission_scaled"),
     *("psnr_given_masks", "psnr_masked_given_masks", "ssim_masked_given_masks"),
     *("depth_error_masked", "depth_share_masked", "normal_degrees_masked", "normal_share_masked"),
+    *("psnr_framed", "framed_share", "depth_off"),
 )
 
 
@@ -113,4 +114,4 @@ def _judged(share: float) -> float | None:
     return None if math.isnan(share) else share
 
 
-STEP = StepKind("evaluate", 5, evaluate)
+STEP = StepKind("evaluate", 6, evaluate)

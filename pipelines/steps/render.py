@@ -14,8 +14,12 @@ from rtgs.core.records import read_record, write_json
 from rtgs.workflow import StepContext, StepKind
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from rtgs.core.cameras import Camera
     from rtgs.evaluate.evaluate import TimedRender
+    from rtgs.methods.model import Model
+    from rtgs.scenes.scene import Scene, View
 
 TIMES_FILE = "render.json"
 GIVEN = "image_given_masks"  # of methods with a third stage: seen through the view's own mask, not the silhouette
@@ -71,12 +75,14 @@ def render(params: RenderParams, context: StepContext) -> None:
     """Render every test view.
 
     Writes ``images/<stem>.png`` (8 bit), ``views/<stem>.safetensors`` (float32: image (3, H, W) not clamped, depth
-    (H, W) z-depth divided by alpha in world units, normal (3, H, W) world frame where the method has one, alpha (H, W);
-    with a third stage also ``image_given_masks``) and ``render.json`` (:class:`RenderTimes`).
+    (H, W) z-depth divided by alpha in world units, normal (3, H, W) world frame where the method has one, alpha (H, W),
+    framed (H, W) int16: training views that show what the pixel shows; with a third stage also ``image_given_masks``)
+    and ``render.json`` (:class:`RenderTimes`).
     """
     import torch
     from safetensors.torch import save_file
 
+    from rtgs.evaluate.coverage import framed_by
     from rtgs.evaluate.images import file_stem, to_bytes, write_png
     from rtgs.methods import Mode, RenderOptions
     from rtgs.scenes.canonical import read_scene
@@ -88,6 +94,7 @@ def render(params: RenderParams, context: StepContext) -> None:
         options = RenderOptions(depth=True, normal="normal" in method.maps, layers=True)
     seconds: dict[str, float] = {}
     (context.out / "views").mkdir()
+    known = _training_depths(method, scene, stage.until) if params.maps and scene.test else []
     for view in scene.test:
         stem = file_stem(view.name)
         with torch.no_grad():
@@ -97,6 +104,7 @@ def render(params: RenderParams, context: StepContext) -> None:
             tensors = {"image": rendered.image.contiguous()}
             if params.maps:
                 tensors |= view_maps(rendered)
+                tensors["framed"] = framed_by(view.camera, _first_surface(view, tensors), known)
             if "transparent" in rendered.maps and view.mask is not None:
                 given = RenderOptions(masks="given")
                 tensors[GIVEN] = method.render(
@@ -107,6 +115,18 @@ def render(params: RenderParams, context: StepContext) -> None:
     RenderTimes(seconds, params.maps).write(context.out)
     if seconds:
         context.log.info("rendered %d test views, %.3f s each", len(seconds), sum(seconds.values()) / len(seconds))
+
+
+def _training_depths(method: Model, scene: Scene, step: int) -> list[tuple[Camera, Tensor]]:
+    """The training cameras, each with the z-depth of what it sees."""
+    return [(view.camera, method.surface_depth(view.camera, step)) for view in scene.train]
+
+
+def _first_surface(view: View, maps: dict[str, Tensor]) -> Tensor:
+    """(H, W) z-depth of what a test view shows, the true one where it is known; 0: nothing."""
+    if view.truth is not None:
+        return view.truth.depth
+    return maps["depth"] * (maps["alpha"] > 0.5)
 
 
 def read_timed(folder: Path, times: RenderTimes, view_name: str, camera: Camera | None = None) -> TimedRender:
@@ -121,12 +141,14 @@ def read_timed(folder: Path, times: RenderTimes, view_name: str, camera: Camera 
     from rtgs.evaluate.layers import GLASS_LAYERS
 
     tensors = read_render(folder, view_name)
+    framed = tensors.get("framed")  # artifacts of older versions have none
     layers = (tensors.get("reflection"), tensors.get("transmission"))
     normal = tensors.get("normal")
     if normal is not None:
         normal = None if camera is None else torch.einsum("ij,jhw->ihw", camera.rotation.float(), normal)
     surface, glass = (tensors.get("depth"), normal), {name: tensors.get(name) for name in GLASS_LAYERS}
-    return TimedRender(tensors["image"], times.of(view_name), *layers, tensors.get(GIVEN), *surface, **glass)
+    seconds = times.of(view_name)
+    return TimedRender(tensors["image"], seconds, *layers, tensors.get(GIVEN), *surface, **glass, framed=framed)
 
 
-STEP = StepKind("render", 4, render)
+STEP = StepKind("render", 5, render)

@@ -112,7 +112,7 @@ def _views(table: EvaluationTable, context: StepContext, count: int) -> tuple[Re
         name = table.rows[row].view
         maps = read_render(context.inputs["render"], name)
         photo = photos[name]
-        shown = {key: maps.get(key) for key in ("depth", "normal", "alpha")}
+        shown = {key: maps.get(key) for key in ("depth", "normal", "alpha", "framed")}
         seen = (name, photo.camera, photo.image, maps["image"], role)
         views.append(ReportView(*seen, layers=_layers(maps), mask=photo.mask, truth=photo.truth, **shown))
     return tuple(views)

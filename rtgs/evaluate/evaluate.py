@@ -9,20 +9,23 @@ from typing import Protocol
 
 from torch import Tensor
 
+from rtgs.evaluate.coverage import FRAMED_BY
 from rtgs.evaluate.images import ERROR_FULL_SCALE, error_map, error_scale_note, file_stem, write_png
 from rtgs.evaluate.layers import GLASS_LAYERS, LayerTruth, layer_scales, layer_scores, metrics_of, why_absent
 from rtgs.evaluate.metrics import psnr, quantized, ssim
 from rtgs.evaluate.records import (
+    FRAMED_METRICS,
     GIVEN_MASK_METRICS,
     METRICS,
     SURFACE_METRICS,
+    WHOLE_SURFACE_METRIC,
     EvaluationTable,
     ObjectFacts,
     RunFacts,
     ViewScore,
 )
 from rtgs.evaluate.settings import EvaluationSettings
-from rtgs.evaluate.surface import surface_scores
+from rtgs.evaluate.surface import depth_off, surface_scores
 from rtgs.pretrained.lpips import InputRange, Lpips, lpips
 from rtgs.pretrained.weights import MissingWeights, WrongWeights
 
@@ -56,6 +59,7 @@ class TimedRender:
     inner: Tensor | None = None  # (3, H, W) part of the transmission that is mirrored inside the glass, likewise
     contents: Tensor | None = None  # (3, H, W) part that comes straight from inside it
     behind: Tensor | None = None  # (3, H, W) part that comes straight through it
+    framed: Tensor | None = None  # (H, W) training views that show what the pixel shows
 
 
 EVERYTHING = EvaluationSettings()
@@ -121,6 +125,12 @@ def _score(render: TimedRender, view: PhotoView, settings: EvaluationSettings, m
     values: dict[str, float | None] = dict.fromkeys(METRICS)
     values["psnr"], values["ssim"] = psnr(image, target), ssim(image, target)
     values["render_seconds"] = render.seconds
+    if render.framed is not None:
+        seen = render.framed >= FRAMED_BY
+        values["framed_share"] = float(seen.double().mean())
+        values["psnr_framed"] = psnr(image, target, mask=seen) if bool(seen.any()) else None
+    if view.truth is not None and render.depth is not None:
+        values["depth_off"] = depth_off(render.depth, view.truth)
     if model is not None:
         for convention in InputRange:
             values[convention.value] = lpips(model, image, target, convention)
@@ -158,6 +168,10 @@ def _explain_absent(rows: Sequence[ViewScore], settings: EvaluationSettings, mis
             missing[name] = "switched off (evaluation.masked=false)"
         elif name in GIVEN_MASK_METRICS:
             missing[name] = "the method has no stage for transparent objects, or the view no mask"
+        elif name in FRAMED_METRICS:
+            missing[name] = f"{absent} of {len(rows)} views were rendered without maps, or show nothing that is framed"
+        elif name == WHOLE_SURFACE_METRIC:
+            missing[name] = "only path-traced captures know the depth, and the method must render it"
         elif name in SURFACE_METRICS:
             missing[name] = "only path-traced captures know the surface in the mask, and the method must render it"
         elif name.endswith("_masked"):

@@ -12,7 +12,7 @@ from rtgs.core import records
 from rtgs.core.errors import RtgsError
 
 FORMAT = "rtgs-evaluation"
-VERSION = 4  # 2: the layer metrics; 3: transmission, given masks; 4: the surface in the mask, the object's mesh
+VERSION = 5  # 2: layers; 3: transmission, given masks; 4: surface in the mask, object's mesh; 5: what is framed
 LAYER_METRICS = (
     "psnr_specular",
     "psnr_diffuse_part",
@@ -23,9 +23,13 @@ GLASS_METRICS = tuple(
     f"psnr_{layer}{scaled}" for layer in ("inner", "contents", "behind") for scaled in ("", "_scaled")
 )
 SURFACE_METRICS = ("depth_error_masked", "depth_share_masked", "normal_degrees_masked", "normal_share_masked")
+WHOLE_SURFACE_METRIC = "depth_off"  # share of the whole picture whose depth is off by more than 5 %
+# Over the pixels that at least three training views frame, and their share.
+FRAMED_METRICS = ("psnr_framed", "framed_share")
 # Seen through the test views' own masks instead of the mesh's silhouette (method.md 7; decision 21).
 GIVEN_MASK_METRICS = ("psnr_given_masks", "psnr_masked_given_masks", "ssim_masked_given_masks")
-# In the order of the columns. Higher is better for psnr*, ssim*, *_share*; lower for lpips*, *_error*, *_degrees*.
+# In the order of the columns. Higher is better for psnr*, ssim*, *_share*; lower for lpips*, *_error*, *_degrees*,
+# *_off.
 METRICS = (
     "psnr",
     "ssim",
@@ -38,6 +42,8 @@ METRICS = (
     *LAYER_METRICS,
     *GIVEN_MASK_METRICS,
     *SURFACE_METRICS,
+    *FRAMED_METRICS,
+    WHOLE_SURFACE_METRIC,
     "psnr_8bit",
     "ssim_8bit",
     "lpips_01_8bit",

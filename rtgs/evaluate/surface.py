@@ -13,6 +13,7 @@ from rtgs.evaluate.records import SURFACE_METRICS
 
 DEPTH_TOLERANCE = 0.03  # of the true depth
 NORMAL_TOLERANCE = 15.0  # degrees
+DEPTH_OFF = 0.05  # of the true depth: from here on it is wrong
 
 
 class SurfaceTruth(Protocol):
@@ -42,6 +43,12 @@ def surface_errors(depth: Tensor, normal: Tensor | None, truth: SurfaceTruth, ma
         return error, torch.zeros(0)
     unit = torch.nn.functional.normalize(normal[:, inside], dim=0)
     return error, torch.rad2deg(torch.acos((unit * truth.normal[:, inside]).sum(0).clamp(-1, 1)))
+
+
+def depth_off(depth: Tensor, truth: SurfaceTruth) -> float | None:
+    """Share of the pixels where something is whose ``depth`` (H, W) is off by more than 5 %; None: nothing anywhere."""
+    error, _ = surface_errors(depth, None, truth, torch.ones_like(depth, dtype=torch.bool))
+    return float((error > DEPTH_OFF).double().mean()) if len(error) else None
 
 
 def surface_scores(depth: Tensor | None, normal: Tensor | None, truth: SurfaceTruth, mask: Tensor) -> dict[str, float]:

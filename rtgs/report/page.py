@@ -14,6 +14,7 @@ from torch import Tensor
 
 from rtgs.core.cameras import Camera
 from rtgs.core.decisions import Decision
+from rtgs.evaluate.coverage import FRAMED_BY
 from rtgs.evaluate.images import ERROR_COLORMAP, ERROR_FULL_SCALE, error_map, to_bytes
 from rtgs.evaluate.records import GLASS_METRICS, EvaluationTable, ViewScore
 from rtgs.report.figures import (
@@ -33,6 +34,7 @@ from rtgs.scenes.truth import ViewTruth
 
 REACHES = ("templates/*",)
 
+_MANY_VIEWS = 12  # training views of a pixel from which on it is drawn white
 TARGET_BYTES = 5_000_000  # of all pictures together, as base64
 # Tried in order until the pictures fit: long side in pixels, JPEG quality.
 PICTURE_STEPS = ((800, 90), (720, 87), (600, 85), (480, 82), (360, 80), (240, 75))
@@ -77,6 +79,7 @@ class ReportView:
     mask: Tensor | None = None  # (H, W) bool, where the masked figures are measured; outlined in the error map
     layers: Mapping[str, Tensor] = field(default_factory=dict)  # as rtgs.report.layers.layer_pixels takes them
     truth: ViewTruth | None = None  # of path-traced captures
+    framed: Tensor | None = None  # (H, W) training views that show what the pixel shows
 
 
 @dataclass(frozen=True)
@@ -241,6 +244,9 @@ _WHEN_PRESENT = (
     Column("depth_share_masked", "depth within 3 % in mask, %", 1, 100.0),
     Column("normal_degrees_masked", "normal error in mask, degrees", 1),
     Column("normal_share_masked", "normal within 15 degrees in mask, %", 1, 100.0),
+    Column("psnr_framed", f"PSNR where {FRAMED_BY} training views look", 2),
+    Column("framed_share", "share of it, %", 1, 100.0),
+    Column("depth_off", "depth off by 5 %, %", 1, 100.0),
     Column("psnr_8bit", "PSNR 8 bit", 2),
     Column("ssim_8bit", "SSIM 8 bit", 4),
     Column("lpips_01_8bit", "LPIPS [0,1] 8 bit", 4),
@@ -346,6 +352,12 @@ def _draw(view: ReportView) -> list[_Drawn]:
     if view.alpha is not None:
         label = Picture("", "Alpha", "accumulated opacity", colorbar_uri("gray"), "0", "1")
         drawn.append(_Drawn(alpha_picture(view.alpha), label))
+    if view.framed is not None:
+        caption = f"training views that show what the pixel shows; outlined: fewer than {FRAMED_BY}"
+        grey = alpha_picture(view.framed.float() / _MANY_VIEWS)
+        few = view.framed < FRAMED_BY
+        label = Picture("", "Coverage", caption, colorbar_uri("gray"), "0", f"≥ {_MANY_VIEWS}")
+        drawn.append(_Drawn(outlined(grey, few) if few.any() else grey, label))
     return drawn
 
 

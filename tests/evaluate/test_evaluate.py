@@ -3,7 +3,7 @@
 import csv
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -78,6 +78,20 @@ def test_masked_only_where_there_is_a_mask() -> None:
     assert table.rows[0].values["psnr_masked"] == psnr(renders[0].image, photos[0].image, mask=photos[0].mask)
     assert table.missing["psnr_masked"] == "2 of 3 views have no mask, or an empty one"
     assert [row.mask_share for row in table.rows] == [pytest.approx(128 / 768), None, 0.0]
+
+
+def test_pixels_that_three_training_views_frame_are_scored_by_themselves() -> None:
+    renders, photos = capture()
+    framed = [torch.full(render.image.shape[1:], 2, dtype=torch.int16) for render in renders[:2]]
+    framed[0][4:, :20] = 3
+    seen = [replace(render, framed=count) for render, count in zip(renders[:2], framed)]
+    table = evaluate_views([*seen, renders[2]], photos, FACTS)
+    first, second, third = (row.values for row in table.rows)
+    assert first["psnr_framed"] == psnr(renders[0].image, photos[0].image, mask=framed[0] == 3)
+    assert first["framed_share"] == pytest.approx(20 * 20 / (32 * 24))
+    assert (second["psnr_framed"], second["framed_share"]) == (None, 0.0)
+    assert (third["psnr_framed"], third["framed_share"]) == (None, None)
+    assert table.missing["framed_share"].startswith("1 of 3 views were rendered without maps")
 
 
 def test_lpips_without_weights_is_absent_with_its_reason() -> None:

@@ -21,7 +21,7 @@ from rtgs.evaluate.evaluate import TimedRender, evaluate_views
 from rtgs.evaluate.publish import Measured, TableSpec, build_table
 from rtgs.evaluate.records import SURFACE_METRICS, EvaluationTable, ObjectFacts, RunFacts, read_json, write_json
 from rtgs.evaluate.settings import EvaluationSettings
-from rtgs.evaluate.surface import hit_shares, surface_scores
+from rtgs.evaluate.surface import depth_off, hit_shares, surface_scores
 from rtgs.evaluate.table_formats import comma_separated, markdown
 from rtgs.mesh.container import ObjectMesh, write_object_mesh
 from rtgs.mesh.record import MeshRecord, MeshTruth
@@ -86,6 +86,15 @@ def test_medians_and_shares_of_the_masked_pixels_that_show_something():
     assert set(surface_scores(depth, None, exact, mask)) == set(SURFACE_METRICS[:2])
     assert surface_scores(None, None, exact, mask) == {}
     assert surface_scores(depth, None, exact, ~(exact.depth > 0)) == {}
+
+
+def test_depth_that_is_off_over_the_whole_picture():
+    exact = truth()  # 11 of 12 rows show something
+    depth = torch.full((12, 14), 2.08)
+    depth[:3] = 2.2
+    depth[3, :7] = 0.0
+    assert depth_off(depth, exact) == pytest.approx(3.5 / 11)
+    assert depth_off(depth, replace(exact, depth=torch.zeros(12, 14))) is None
 
 
 def test_fallbacks_are_counted_in_the_masks():
