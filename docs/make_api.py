@@ -6,6 +6,7 @@ that names a parameter which the function does not have.
 
 from __future__ import annotations
 
+import ast
 import logging
 import re
 import sys
@@ -166,11 +167,22 @@ def _fields(thing: griffe.Class) -> Iterator[str]:
         if "property" in field.labels or field.name.startswith("_") or set_in_init:
             continue
         about = field.docstring.value if field.docstring else _comment(field)
-        default = "" if field.value is None or "field(" in str(field.value) else f" = {field.value}"
+        default = "" if (value := _default(field)) is None else f" = {value}"
         found.append((f"`{field.name}{f': {field.annotation}' if field.annotation else ''}{default}`", about))
     if found:
         yield "Fields:\n"
         yield from _items(found)
+
+
+def _default(field: griffe.Attribute) -> str | None:
+    """As it is written, also within ``field(default=...)``; None: there is none, or a function makes it."""
+    if field.value is None:
+        return None
+    call = ast.parse(str(field.value), mode="eval").body
+    if isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "field":
+        given = {keyword.arg: keyword.value for keyword in call.keywords}
+        return ast.unparse(given["default"]) if "default" in given else None
+    return str(field.value)
 
 
 def _comment(field: griffe.Attribute) -> str:

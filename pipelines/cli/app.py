@@ -104,15 +104,15 @@ def _recorded(run: _Run) -> bool:
     Looked up first in what the run's folder says, so that repeating a run stays quick: trackers take seconds to import.
     A job of a sweep may share its folder with another, so the tracker itself has the last word.
     """
-    from pipelines.publishing.results import is_tracked
+    from pipelines.publishing.results import is_tracked, tracked_step
 
     if not run.plan.complete or run.membership.outcomes.executed(run.plan):
         return False
     tracking = run.config.tracking
     if tracking.kind == "off" or is_tracked(run.config, run.plan, run.place):
         return True
-    last = run.plan.steps[-1].step
-    return run.membership.sweep is not None and run.tracking.finished(tracking.experiment, last.fingerprint)
+    key = tracked_step(run.plan).fingerprint
+    return run.membership.sweep is not None and run.tracking.finished(tracking.experiment, key)
 
 
 def _tracked(run: _Run, parent: str) -> RunOutcome:

@@ -18,6 +18,7 @@ from pipelines.publishing.run_record import RUN_FILE, RunRecord
 from pipelines.steps.evaluate import TABLE_CSV, TABLE_JSON
 from pipelines.steps.pictures import final_pictures, training_pictures
 from pipelines.steps.report import PAGE
+from pipelines.steps.report import STEP as REPORT
 from pipelines.steps.training import read_history, stage_params
 from rtgs.config.schema import Choices, RunConfig
 from rtgs.core.errors import RtgsError
@@ -27,7 +28,7 @@ from rtgs.prepare.masks.report import FILES as MASK_FILES
 from rtgs.prepare.poses.quality import PICTURE_FILE, REPORT_FILE
 from rtgs.track import RunInfo, Tracker
 from rtgs.track.source import git_tags, installed
-from rtgs.workflow import Artifacts, Plan, StepResult, Store
+from rtgs.workflow import Artifacts, Plan, Step, StepResult, Store
 
 CONFIG_FILE = "config.yaml"
 INSTALLED_FILE = "requirements.txt"
@@ -178,9 +179,14 @@ def _figure(value: float | None, form: str) -> str:
     return "n/a" if value is None else form.format(value)
 
 
+def tracked_step(plan: Plan) -> Step:
+    """The step by whose key a tracker knows a run: its report, which depends on everything that the run is."""
+    return next(planned.step for planned in plan if planned.step.name == REPORT.name)
+
+
 def run_info(config: RunConfig, choices: Choices, plan: Plan, parent: str = "") -> RunInfo:
     """How a run appears in the tracker: names as tags, each step linked by its fingerprint."""
-    target = plan.steps[-1].step
+    target = tracked_step(plan)
     tags = {f"rtgs.{key}": getattr(choices, key) for key in ("scene", "method", "preset", "ablation", "experiment")}
     tags |= {f"rtgs.step.{planned.step.name}": planned.step.fingerprint for planned in plan}
     tags |= {"rtgs.seed": str(config.seed), **git_tags()}

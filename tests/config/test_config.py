@@ -194,13 +194,16 @@ def test_a_scene_is_named_after_its_folder(path, name):
 
 
 def keys_in(group: str, name: str) -> set[str]:
-    """What a file of ``conf/`` sets."""
+    """What a file of ``conf/`` and those that it inherits from set."""
 
     def walk(values: dict, *before: str) -> Iterator[str]:
         for key, value in values.items():
             yield from walk(value, *before, key) if isinstance(value, dict) else [".".join((*before, key))]
 
-    return set(walk(yaml.safe_load((conf_dir() / group / f"{name}.yaml").read_text())))
+    values = yaml.safe_load((conf_dir() / group / f"{name}.yaml").read_text())
+    others = [other for other in values.pop("defaults", ()) if other != "_self_"]
+    inherited = (keys_in(".", other[1:]) if other.startswith("/") else keys_in(group, other) for other in others)
+    return set(walk(values)).union(*inherited)
 
 
 def test_method_preset_and_ablation_compose_and_no_ablation_is_idle():

@@ -2,7 +2,8 @@
 
 ``golden_checkpoints.json`` holds the digest of every training artifact of the four methods on ball_statue, toycar and
 fox, preset ``smoke`` and 300 steps of ``quick``, by step and key. One instruction set and one PyTorch made them; on
-others, bits differ, and the test is skipped. When a recipe or a result is meant to change, its line goes.
+others, bits differ, and the test is skipped. When a recipe or a result is meant to change, its lines go: a stage
+without a line is not compared, but of every method one is.
 """
 
 from __future__ import annotations
@@ -41,5 +42,6 @@ def test_checkpoints_have_the_recorded_bits(scene: str, method: str, tmp_path: P
         if artifact.manifest.step.startswith("train_"):
             key = f"{artifact.manifest.step} {artifact.manifest.fingerprint[:16]}"
             found[key] = sha256((artifact.folder / "checkpoint" / "state.safetensors").read_bytes()).hexdigest()
-    assert len(found) >= 2
-    assert found == {key: GOLDEN["checkpoints"].get(key) for key in found}
+    known = {key: GOLDEN["checkpoints"][key] for key in found if key in GOLDEN["checkpoints"]}
+    assert known
+    assert {key: found[key] for key in known} == known
