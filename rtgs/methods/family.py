@@ -41,6 +41,6 @@ TRANSMITTANCE = StageSpec(
     on=_transmittance_on,
     on_key="method.transmittance.enabled",
     needs_object=True,
-    version=5,
+    version=6,
 )
 """Straight rays through the transparent object, all sets jointly."""
