@@ -10,13 +10,13 @@ import torch
 from rtgs.core.errors import RtgsError
 from rtgs.mesh.choose import Choice, choose_object_mesh, read_given
 from rtgs.mesh.pane import drawn_pane, fit_pane, is_flat
-from rtgs.mesh.settings import HullSettings, ObjectSettings
+from rtgs.mesh.settings import HullSettings, ObjectSettings, SurfaceSettings
 from rtgs.mesh.silhouettes import MaskSet, mask_set
 from rtgs.mesh.triangles import TriangleMesh, read_mesh_obj, write_mesh_obj, write_mesh_ply
 from tests.mesh.shapes import box, camera_at, pane, sphere
 from tests.mesh.test_hull import masks_of, ring
 
-SETTINGS = ObjectSettings(hull=HullSettings(voxels=40))
+SETTINGS = ObjectSettings(hull=HullSettings(voxels=40), surface=SurfaceSettings(fit="carved"))
 
 
 def in_front(count: int) -> list:

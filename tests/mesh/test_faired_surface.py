@@ -256,7 +256,8 @@ def test_the_choice_tells_and_the_files_keep_it(tmp_path) -> None:
     again = read_object_mesh(tmp_path)
     assert again.surface == "free"
     np.testing.assert_allclose(again.corners, choice.mesh.corners, atol=1e-6)
-    plain = choose_object_mesh("auto", masks, ObjectSettings(hull=HullSettings(voxels=32)), no_fusion)
+    carved = ObjectSettings(hull=HullSettings(voxels=32), surface=SurfaceSettings(fit="carved"))
+    plain = choose_object_mesh("auto", masks, carved, no_fusion)
     assert (plain.mesh.surface, plain.fit) == ("", None)
 
 
