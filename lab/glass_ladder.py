@@ -46,6 +46,11 @@ SMALL = (
     *("method.transmittance.interface.count=2000", "method.loss.perceptual=0"),
 )
 """Half of quick's steps on a quarter of its pixels."""
+LEARNED = (
+    *("method.loss.clipped=false", "method.optics.blend=srgb", "method.transmittance.normal=base"),
+    *("method.transmittance.wall.light=learned", "mesh.object.surface.fit=carved"),
+)
+"""The glass that the rungs are of: learned weights on the hull as it is carved, as in docs/lab/transmittance.md."""
 BRIGHT = 0.9  # quantile of the true reflected layer in the mask
 _T = "method.transmittance"
 _I = f"{_T}.interface"
@@ -210,7 +215,7 @@ def base_config(scene: str, arguments: argparse.Namespace) -> RunConfig:
 
 def sized(arguments: argparse.Namespace) -> list[str]:
     """The words beside scene, method, preset and seed."""
-    return [*(SMALL if arguments.size == "small" else ()), *arguments.set]
+    return [*LEARNED, *(SMALL if arguments.size == "small" else ()), *arguments.set]
 
 
 def run(name: str, setting: Setting, arguments: argparse.Namespace, seed: int) -> Measured | str:

@@ -8,12 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipelines.steps.training import last_training, load_method
-from pipelines.steps.views import read_render, view_maps
+from pipelines.steps.views import COVERAGE, read_coverage, read_render, view_maps
 from rtgs.core.errors import RtgsError
 from rtgs.core.records import read_record, write_json
 from rtgs.workflow import StepContext, StepKind
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from torch import Tensor
 
     from rtgs.core.cameras import Camera
@@ -75,14 +77,13 @@ def render(params: RenderParams, context: StepContext) -> None:
     """Render every test view.
 
     Writes ``images/<stem>.png`` (8 bit), ``views/<stem>.safetensors`` (float32: image (3, H, W) not clamped, depth
-    (H, W) z-depth divided by alpha in world units, normal (3, H, W) world frame where the method has one, alpha (H, W),
-    framed (H, W) int16: training views that show what the pixel shows; with a third stage also ``image_given_masks``)
-    and ``render.json`` (:class:`RenderTimes`).
+    (H, W) z-depth divided by alpha in world units, normal (3, H, W) world frame where the method has one, alpha (H, W);
+    with a third stage also ``image_given_masks``), ``coverage.safetensors`` (by view name (H, W) int16: training views
+    that show what the pixel shows) and ``render.json`` (:class:`RenderTimes`).
     """
     import torch
     from safetensors.torch import save_file
 
-    from rtgs.evaluate.coverage import framed_by
     from rtgs.evaluate.images import file_stem, to_bytes, write_png
     from rtgs.methods import Mode, RenderOptions
     from rtgs.scenes.canonical import read_scene
@@ -94,7 +95,7 @@ def render(params: RenderParams, context: StepContext) -> None:
         options = RenderOptions(depth=True, normal="normal" in method.maps, layers=True)
     seconds: dict[str, float] = {}
     (context.out / "views").mkdir()
-    known = _training_depths(method, scene, stage.until) if params.maps and scene.test else []
+    surfaces: dict[str, Tensor] = {}
     for view in scene.test:
         stem = file_stem(view.name)
         with torch.no_grad():
@@ -104,7 +105,7 @@ def render(params: RenderParams, context: StepContext) -> None:
             tensors = {"image": rendered.image.contiguous()}
             if params.maps:
                 tensors |= view_maps(rendered)
-                tensors["framed"] = framed_by(view.camera, _first_surface(view, tensors), known)
+                surfaces[view.name] = _first_surface(view, tensors)
             if "transparent" in rendered.maps and view.mask is not None:
                 given = RenderOptions(masks="given")
                 tensors[GIVEN] = method.render(
@@ -112,21 +113,48 @@ def render(params: RenderParams, context: StepContext) -> None:
                 ).image.contiguous()
         save_file(tensors, context.out / "views" / f"{stem}.safetensors")
         write_png(context.out / "images" / f"{stem}.png", to_bytes(rendered.image))
+    if surfaces:
+        save_file(_coverage(method, scene, stage.until, surfaces), context.out / COVERAGE)
     RenderTimes(seconds, params.maps).write(context.out)
     if seconds:
         context.log.info("rendered %d test views, %.3f s each", len(seconds), sum(seconds.values()) / len(seconds))
 
 
-def _training_depths(method: Model, scene: Scene, step: int) -> list[tuple[Camera, Tensor]]:
-    """The training cameras, each with the z-depth of what it sees."""
-    return [(view.camera, method.surface_depth(view.camera, step)) for view in scene.train]
+def _coverage(method: Model, scene: Scene, step: int, surfaces: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """By test view: (H, W) int16 training views that show what the pixel shows, where it is ``surfaces`` (z-depth)."""
+    from rtgs.evaluate.coverage import at_size, framed_by, judged
+
+    pictures = []
+    for view in scene.test:
+        camera = judged(view.camera)
+        pictures.append((camera, at_size(surfaces[view.name], camera.height, camera.width)))
+    cameras = (judged(view.camera) for view in scene.train)
+    counts = framed_by(pictures, ((camera, _base_surface(method, camera, step)) for camera in cameras))
+    sizes = ((view.camera.height, view.camera.width) for view in scene.test)
+    return {view.name: at_size(count, *size) for view, count, size in zip(scene.test, counts, sizes, strict=True)}
+
+
+def _base_surface(method: Model, camera: Camera, step: int) -> Tensor:
+    """(H, W) z-depth of the base set, 0 where it covers less than half of the pixel."""
+    import torch
+
+    from rtgs.methods import Mode, RenderOptions
+    from rtgs.methods.parts.part import Frame
+
+    wanted = RenderOptions(depth=True)
+    with torch.no_grad():
+        found = method.base.rasterize(Frame(camera, step, Mode.EVALUATE, wanted), wanted).buffers
+    assert found.depth is not None
+    return _covered(found.depth / found.alpha.clamp_min(1e-6), found.alpha)
 
 
 def _first_surface(view: View, maps: dict[str, Tensor]) -> Tensor:
     """(H, W) z-depth of what a test view shows, the true one where it is known; 0: nothing."""
-    if view.truth is not None:
-        return view.truth.depth
-    return maps["depth"] * (maps["alpha"] > 0.5)
+    return view.truth.depth if view.truth is not None else _covered(maps["depth"], maps["alpha"])
+
+
+def _covered(depth: Tensor, alpha: Tensor) -> Tensor:
+    return depth * (alpha > 0.5)
 
 
 def read_timed(folder: Path, times: RenderTimes, view_name: str, camera: Camera | None = None) -> TimedRender:
@@ -141,13 +169,12 @@ def read_timed(folder: Path, times: RenderTimes, view_name: str, camera: Camera 
     from rtgs.evaluate.layers import GLASS_LAYERS
 
     tensors = read_render(folder, view_name)
-    framed = tensors.get("framed")  # artifacts of older versions have none
     layers = (tensors.get("reflection"), tensors.get("transmission"))
     normal = tensors.get("normal")
     if normal is not None:
         normal = None if camera is None else torch.einsum("ij,jhw->ihw", camera.rotation.float(), normal)
     surface, glass = (tensors.get("depth"), normal), {name: tensors.get(name) for name in GLASS_LAYERS}
-    seconds = times.of(view_name)
+    seconds, framed = times.of(view_name), read_coverage(folder, view_name)
     return TimedRender(tensors["image"], seconds, *layers, tensors.get(GIVEN), *surface, **glass, framed=framed)
 
 

@@ -12,7 +12,7 @@ from pipelines.steps import extract_mesh
 from pipelines.steps.evaluate import TABLE_JSON
 from pipelines.steps.render import RenderTimes
 from pipelines.steps.training import last_training, read_history, read_summary
-from pipelines.steps.views import read_render
+from pipelines.steps.views import read_coverage, read_render
 from rtgs.core.decisions import Decision
 from rtgs.core.records import damaged
 from rtgs.mesh.record import RECORD_FILE, MeshRecord
@@ -112,7 +112,8 @@ def _views(table: EvaluationTable, context: StepContext, count: int) -> tuple[Re
         name = table.rows[row].view
         maps = read_render(context.inputs["render"], name)
         photo = photos[name]
-        shown = {key: maps.get(key) for key in ("depth", "normal", "alpha", "framed")}
+        shown = {key: maps.get(key) for key in ("depth", "normal", "alpha")}
+        shown["framed"] = read_coverage(context.inputs["render"], name)
         seen = (name, photo.camera, photo.image, maps["image"], role)
         views.append(ReportView(*seen, layers=_layers(maps), mask=photo.mask, truth=photo.truth, **shown))
     return tuple(views)

@@ -10,6 +10,8 @@ if TYPE_CHECKING:
 
     from rtgs.methods import RenderedView
 
+COVERAGE = "coverage.safetensors"
+
 
 def view_maps(rendered: RenderedView) -> dict[str, Tensor]:
     """Depth, normal, alpha and the layers of a view rendered with ``depth``, as the step ``render`` stores them."""
@@ -20,6 +22,17 @@ def view_maps(rendered: RenderedView) -> dict[str, Tensor]:
     if rendered.layers is not None:
         maps |= {name: tensor.float() for name, tensor in rendered.layers.items()}
     return {name: tensor.contiguous() for name, tensor in maps.items() if tensor is not None}
+
+
+def read_coverage(folder: Path, view_name: str) -> Tensor | None:
+    """(H, W) int16 training views that show what each pixel of a test view shows; None: the views have no maps, or an
+    older version rendered them."""
+    from safetensors import safe_open
+
+    if not (folder / COVERAGE).is_file():
+        return None
+    with safe_open(folder / COVERAGE, framework="pt") as file:
+        return file.get_tensor(view_name)
 
 
 def read_render(folder: Path, view_name: str) -> dict[str, Tensor]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from rtgs.core.recipe import UNLESS_DEFAULT
+from rtgs.core.recipe import UNLESS
 from rtgs.core.refuse import refuse_bad_numbers, refuse_unknown_words, refuse_unless
 
 MeshSource = Literal["auto", "hull", "tsdf", "given"]
@@ -130,7 +130,9 @@ class ObjectSettings:
     """Largest connected pieces of the TSDF mesh that stay."""
     hull: HullSettings = field(default_factory=HullSettings)
     pane: PaneSettings = field(default_factory=PaneSettings)
-    surface: SurfaceSettings = field(default=SurfaceSettings(), metadata=UNLESS_DEFAULT)
+    surface: SurfaceSettings = field(
+        default=SurfaceSettings(), metadata={"recipe": UNLESS, "value": SurfaceSettings(fit="carved")}
+    )
 
     def __post_init__(self) -> None:
         refuse_bad_numbers(self, "mesh.object")

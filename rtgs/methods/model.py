@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
-import torch
 from torch import Tensor
 
 from rtgs.core.cameras import Camera
@@ -118,14 +117,6 @@ class Model:
         if found is None:
             raise KeyError(f"method {self.spec.name} has no set {name!r} now: it has {[s.name for s in self.sets]}")
         return found
-
-    @torch.no_grad()
-    def surface_depth(self, camera: Camera, step: int) -> Tensor:
-        """(H, W) z-depth of the base set, 0 where it covers less than half of the pixel."""
-        wanted = RenderOptions(depth=True)
-        buffers = self.base.rasterize(Frame(camera, step, Mode.EVALUATE, wanted), wanted).buffers
-        assert buffers.depth is not None
-        return torch.where(buffers.alpha > 0.5, buffers.depth / buffers.alpha.clamp_min(1e-6), 0.0)
 
     def recipe(self, stage: str) -> MethodSettings:
         """The settings as the stage of this name reads them."""

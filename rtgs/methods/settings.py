@@ -272,5 +272,5 @@ class MethodSettings:
         if self.transmittance.wall.light == "fresnel" and self.optics.blend != "linear":
             raise RtgsError(
                 "method.transmittance.wall.light=fresnel gives shares of linear light, but "
-                f"method.optics.blend={self.optics.blend}: set it to linear"
+                f"method.optics.blend={self.optics.blend}: set it to linear, or wall.light=learned"
             )

@@ -28,7 +28,10 @@ TOLD_IN_FULL = ("ball_statue rtgs smoke none", "toycar envgs paper none")
 OVERRIDES = (
     ("rtgs", "seed=3"),
     ("rtgs", "seed=3 schedule.total=333 scene.long_side=120"),
-    ("rtgs", "method.optics.blend=linear"),
+    ("rtgs", "method.optics.blend=srgb method.transmittance.wall.light=learned method.loss.clipped=false"),
+    ("rtgs", "method.transmittance.wall.bounces=2 method.transmittance.wall.index_rate=0.01"),
+    ("rtgs", "mesh.object.surface.fit=carved method.transmittance.normal=base"),
+    ("rtgs", "method.optimizer.decay_from=1.0 method.init.orientation=published"),
     ("rtgs", "method.optics.weight=literal method.optics.remap=none method.optics.masking=separable"),
     ("rtgs", "method.transmittance.interface.normal_hold=0.0"),
     ("rtgs", "method.transmittance.interface.normal_hold=5.0 method.transmittance.interface.normal_loss=0.2"),

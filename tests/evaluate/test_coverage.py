@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from rtgs.core.cameras import Camera
-from rtgs.evaluate.coverage import framed_by
+from rtgs.evaluate.coverage import LONG_SIDE, at_size, framed, framed_by, judged
 
 WIDTH, HEIGHT, FOCAL, AWAY = 40, 30, 40.0, 2.0
 
@@ -26,32 +26,45 @@ def flat(z: float) -> torch.Tensor:
 def test_a_camera_to_the_side_shows_the_columns_that_are_left(columns: int):
     """On a plane at a depth of 2 a step of 0.05 is one pixel."""
     aside = camera(columns * AWAY / FOCAL)
-    count = framed_by(camera(0.0), flat(AWAY), [(aside, flat(AWAY))])
-    expected = torch.zeros(HEIGHT, WIDTH, dtype=torch.int16)
-    expected[:, columns:] = 1
-    assert torch.equal(count, expected)
+    expected = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    expected[:, columns:] = True
+    assert torch.equal(framed(camera(0.0), flat(AWAY), aside, flat(AWAY)), expected)
 
 
 def test_views_are_counted_and_those_that_look_away_are_not():
     others = [(camera(0.0), flat(AWAY))] * 3 + [(camera(0.0, turned=True), flat(AWAY))]
-    assert bool((framed_by(camera(0.0), flat(AWAY), others) == 3).all())
+    twice = framed_by([(camera(0.0), flat(AWAY)), (camera(0.0, turned=True), flat(AWAY))], iter(others))
+    assert [count.dtype for count in twice] == [torch.int16] * 2
+    assert bool((twice[0] == 3).all())
+    assert bool((twice[1] == 1).all())
 
 
 def test_what_is_hidden_from_a_camera_is_not_shown_by_it():
     """A thing at half the depth covers the right half of the other picture; what is 2 % nearer hides nothing."""
     hiding = flat(0.98 * AWAY)
     hiding[:, WIDTH // 2 :] = AWAY / 2
-    count = framed_by(camera(0.0), flat(AWAY), [(camera(0.0), hiding)])
-    assert bool((count[:, : WIDTH // 2] == 1).all())
-    assert bool((count[:, WIDTH // 2 :] == 0).all())
+    shown = framed(camera(0.0), flat(AWAY), camera(0.0), hiding)
+    assert bool(shown[:, : WIDTH // 2].all())
+    assert not shown[:, WIDTH // 2 :].any()
 
 
-def test_the_sky_is_shown_where_the_other_picture_looks_the_same_way_and_has_nothing_before_it():
-    sky = flat(0.0)
-    other = flat(0.0)
+@pytest.mark.parametrize("away", [0.0, 1e-9, 3.0])
+def test_the_sky_is_shown_where_the_other_picture_looks_the_same_way_and_has_nothing_before_it(away: float):
+    sky, other = flat(0.0), flat(0.0)
     other[: HEIGHT // 2] = 5.0
-    count = framed_by(camera(0.0), sky, [(camera(3.0), other)])
-    assert bool((count[HEIGHT // 2 :] == 1).all()), "so far away that the step to the side is nothing"
-    assert bool((count[: HEIGHT // 2] == 0).all())
-    near = framed_by(camera(0.0), flat(AWAY), [(camera(0.0), sky)])
-    assert bool((near == 1).all()), "a picture without a depth hides nothing"
+    shown = framed(camera(0.0), sky, camera(away), other)
+    assert bool(shown[HEIGHT // 2 :].all()), "so far away that a step to the side is nothing"
+    assert not shown[: HEIGHT // 2].any()
+    assert not framed(camera(0.0), sky, camera(away, turned=True), sky).any()
+    assert bool(framed(camera(0.0), flat(AWAY), camera(0.0), sky).all()), "a picture without a depth hides nothing"
+
+
+def test_large_pictures_are_judged_at_fewer_pixels():
+    there = torch.zeros(3, dtype=torch.float64)
+    large = Camera(torch.eye(3, dtype=torch.float64), there, 900.0, 900.0, 500.0, 300.0, 1000, 600)
+    small = judged(large)
+    assert (small.width, small.height) == (LONG_SIDE, 240)
+    assert judged(small) is small
+    values = torch.arange(12).reshape(3, 4)
+    assert torch.equal(at_size(at_size(values, 9, 12), 3, 4), values)
+    assert at_size(values, 6, 8)[:2, :2].tolist() == [[0, 0], [0, 0]]

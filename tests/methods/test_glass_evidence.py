@@ -147,6 +147,7 @@ def test_points_near_a_surface_are_told_by_their_pixel(plain: GlassScene):
     for z, near in ((2.04, True), (1.96, True), (2.06, False), (1.0, False)):
         assert bool((near_surface(center + z * along, camera, depth, 0.05) == near).all())
     assert not near_surface(center - along, camera, depth, 10.0).any(), "behind the camera"
+    assert not near_surface(center + 0.01 * along, camera, torch.zeros_like(depth), 0.05).any(), "no surface there"
 
 
 def test_the_weight_of_some_gaussians_is_their_share_of_the_coverage(plain: GlassScene):

@@ -100,6 +100,8 @@ def on_surface(guide: ObjectGuide, views: Iterable[View], weights: SurfaceWeight
 
 
 def near_surface(points: Tensor, camera: Camera, depth: Tensor, reach: float) -> Tensor:
-    """(N,) bool: points (N, 3) that lie within ``reach`` of the surface (H, W) z-depth of the pixel they are in."""
+    """(N,) bool: points (N, 3) that lie within ``reach`` of the surface of the pixel they are in, (H, W) z-depth, 0
+    where there is none."""
     index, z, framed = _pixels(camera, points)
-    return framed & ((z - depth.reshape(-1)[index]).abs() < reach)
+    surface = depth.reshape(-1)[index]
+    return framed & (surface > 0) & ((z - surface).abs() < reach)

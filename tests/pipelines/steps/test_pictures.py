@@ -76,7 +76,11 @@ def test_ellipsoids_show_their_normals(capture, tmp_path: Path, monkeypatch):  #
     assert set(maps) == {"image", "depth", "normal", "alpha"}
     assert bool((maps["normal"].norm(dim=0) <= maps["alpha"] + 1e-5).all())
     assert bool(maps["normal"].any())
-    assert "<b>Normal</b>" in (tmp_path / "runs" / "round" / "report.html").read_text()
+    page = (tmp_path / "runs" / "round" / "report.html").read_text()
+    assert "<b>Normal</b>" in page
+    assert "<b>Coverage</b>" in page
+    found = json.loads((tmp_path / "runs" / "round" / "metrics.json").read_text())["mean"]
+    assert 0 <= found["framed_share"] <= 1
 
 
 def test_a_run_that_finds_its_training_cached_has_the_sliders_too(trained, capture, monkeypatch):  # noqa: F811

@@ -11,9 +11,10 @@ import pytest
 import torch
 
 from pipelines.steps import render
-from pipelines.steps.views import read_render
+from pipelines.steps.views import read_coverage, read_render
 from rtgs.core.cameras import Camera
 from rtgs.methods import Mode, RenderedView, RenderOptions
+from rtgs.methods.parts.part import Frame, Raster
 from rtgs.render.buffers import RasterBuffers
 from rtgs.scenes.canonical import save_scene
 from rtgs.scenes.scene import Scene, View
@@ -30,6 +31,18 @@ class CountingMethod:
     glass: bool
     maps: tuple[str, ...] = ("depth", "normal")
     asked: list[tuple[str, RenderOptions]] = field(default_factory=list)
+    base_depth: float = 2.0  # of the base set; what is shown lies at 2
+    base_alpha: float = 1.0
+
+    @property
+    def base(self) -> CountingMethod:
+        return self
+
+    def rasterize(self, frame: Frame, wanted: RenderOptions) -> Raster:
+        assert (frame.camera.name, frame.step, frame.mode) == ("2.png", 100, Mode.EVALUATE)
+        assert wanted == RenderOptions(depth=True)
+        alpha = torch.full((HEIGHT, WIDTH), self.base_alpha)
+        return Raster(RasterBuffers(torch.zeros(3, HEIGHT, WIDTH), alpha, self.base_depth * alpha))
 
     def render(
         self, camera: Camera, step: int, mode: Mode, options: RenderOptions, mask: torch.Tensor | None
@@ -66,6 +79,26 @@ def run(context: StepContext, method: CountingMethod, monkeypatch: pytest.Monkey
     monkeypatch.setattr(render, "last_training", lambda inputs: inputs["train_diffuse"])
     monkeypatch.setattr(render, "load_method", lambda folder, scene: (method, SimpleNamespace(until=100)))
     render.render(render.RenderParams(maps=maps), context)
+
+
+@pytest.mark.parametrize(
+    ("changes", "shown"), [({}, 1), ({"base_depth": 1.0}, 0), ({"base_depth": 1.0, "base_alpha": 0.4}, 1)]
+)
+def test_training_views_that_show_a_pixel_are_counted(context, monkeypatch, changes: dict, shown: int) -> None:
+    """The one training view stands where the test views stand; what covers less than half of a pixel hides nothing."""
+    run(context, CountingMethod(glass=False, **changes), monkeypatch, maps=True)
+    for name in ("0.png", "1.png"):
+        count = read_coverage(context.out, name)
+        assert count is not None
+        assert count.dtype == torch.int16
+        assert torch.equal(count, torch.full((HEIGHT, WIDTH), shown, dtype=torch.int16))
+        times = render.RenderTimes.read(context.out)
+        assert torch.equal(render.read_timed(context.out, times, name).framed, count)
+
+
+def test_without_maps_nothing_is_counted(context, monkeypatch) -> None:
+    run(context, CountingMethod(glass=False), monkeypatch, maps=False)
+    assert read_coverage(context.out, "0.png") is None
 
 
 @pytest.mark.parametrize("maps", [True, False])
