@@ -20,6 +20,7 @@ def test_recipes_are_what_they_were(method):
             assert found[words] == steps
     expected = {words: key for words, key in golden["digests"].items() if words.split()[1] == method}
     plain = found[f"ball_statue {method} smoke none"]
-    assert all(steps != plain for words, steps in found.items() if "=" in words), "words that restate the default"
+    if method == "rtgs":  # which reads them all
+        assert all(steps != plain for words, steps in found.items() if "=" in words), "words that restate the default"
     told = "recipes changed; where they are meant to: .venv/bin/python tests/config/recipes.py"
     assert {words: digest(steps) for words, steps in found.items()} == expected, told
