@@ -7,6 +7,7 @@ set(RTGS_KERNELS
   gaussians/activation.cpp
   optimizer/adam.cpp
   image/mirror.cpp
+  image/srgb.cpp
   raster/surfel_project.cpp
   raster/surfel_project_backward.cpp
   raster/bins.cpp
@@ -28,6 +29,7 @@ set(RTGS_BINDINGS
   bind/activation.cpp
   bind/optimizer.cpp
   bind/mirror.cpp
+  bind/srgb.cpp
   bind/raster.cpp
   bind/ellipsoids.cpp
   trace/bvh_tree.cpp

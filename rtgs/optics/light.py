@@ -2,11 +2,17 @@
 
 ``blend`` is :attr:`rtgs.optics.settings.OpticsSettings.blend`: "srgb", where both functions return what they are given
 (the paper and EnvGS blend encoded colours), or "linear" (IEC 61966-2-1). Any dtype and shape, differentiable.
+float32 goes through native kernels, whose results do not depend on the number of threads as those of torch's powers do;
+other dtypes are in plain torch.
 """
 
 from __future__ import annotations
 
-from torch import Tensor, where
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from rtgs.native import core
 
 _DARK_COLOR, _DARK_LIGHT = 0.04045, 0.0031308  # below, both ways are a line of this slope
 _SLOPE, _OFFSET, _POWER = 12.92, 0.055, 2.4
@@ -16,13 +22,56 @@ def decoded(color: Tensor, blend: str) -> Tensor:
     """Linear light of encoded colours; the curve goes on above 1, the line below 0."""
     if blend == "srgb":
         return color
-    bright = ((color.clamp_min(_DARK_COLOR) + _OFFSET) / (1 + _OFFSET)) ** _POWER
-    return where(color <= _DARK_COLOR, color / _SLOPE, bright)
+    return _Decode.apply(color) if color.dtype == torch.float32 else decoded_twin(color)  # type: ignore[return-value]
 
 
 def encoded(light: Tensor, blend: str) -> Tensor:
     """The inverse of :func:`decoded`."""
     if blend == "srgb":
         return light
+    return _Encode.apply(light) if light.dtype == torch.float32 else encoded_twin(light)  # type: ignore[return-value]
+
+
+def decoded_twin(color: Tensor) -> Tensor:
+    """:func:`decoded` to linear light in plain torch."""
+    bright = ((color.clamp_min(_DARK_COLOR) + _OFFSET) / (1 + _OFFSET)) ** _POWER
+    return torch.where(color <= _DARK_COLOR, color / _SLOPE, bright)
+
+
+def encoded_twin(light: Tensor) -> Tensor:
+    """:func:`encoded` from linear light in plain torch."""
     bright = (1 + _OFFSET) * light.clamp_min(_DARK_LIGHT) ** (1 / _POWER) - _OFFSET
-    return where(light <= _DARK_LIGHT, _SLOPE * light, bright)
+    return torch.where(light <= _DARK_LIGHT, _SLOPE * light, bright)
+
+
+def _filled(kernel: str, *given: Tensor) -> Tensor:
+    """What a native kernel makes of contiguous numbers: as many, of the same shape."""
+    result = torch.empty(given[0].shape)
+    getattr(core, kernel)(*(each.numpy() for each in given), result.numpy(), torch.get_num_threads())
+    return result
+
+
+class _Decode(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, color: Tensor) -> Tensor:
+        color = color.detach().contiguous()
+        ctx.save_for_backward(color)
+        return _filled("srgb_decode", color)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, upstream: Tensor) -> Tensor:  # type: ignore[override]
+        return _filled("srgb_decode_backward", *ctx.saved_tensors, upstream.contiguous())
+
+
+class _Encode(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, light: Tensor) -> Tensor:
+        light = light.detach().contiguous()
+        ctx.save_for_backward(light)
+        return _filled("srgb_encode", light)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, upstream: Tensor) -> Tensor:  # type: ignore[override]
+        return _filled("srgb_encode_backward", *ctx.saved_tensors, upstream.contiguous())

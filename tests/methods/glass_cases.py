@@ -17,6 +17,7 @@ from rtgs.mesh.triangles import TriangleMesh
 from rtgs.methods import create_method
 from rtgs.methods.model import Model
 from rtgs.methods.settings import InterfaceSettings, MethodSettings, TransmittanceSettings
+from rtgs.optics.settings import WallSettings
 from rtgs.scenes.scene import Scene, View
 from rtgs.train.seeds import generator_for
 from rtgs.train.settings import ScheduleSettings
@@ -114,6 +115,16 @@ def glass_recipe(**changes) -> MethodSettings:
     base = recipe("rtgs")
     loss = replace(base.loss, specular=0.2, specular_start=0.5, transmission_depth=0.2, transmission_depth_start=0.75)
     return replace(base, loss=loss, transmittance=replace(default, **changes))
+
+
+def fresnel(**changes: object) -> MethodSettings:
+    base = glass_recipe(normal="mesh")
+    return replace(
+        base,
+        optics=replace(base.optics, blend="linear"),
+        loss=replace(base.loss, clipped=True),
+        transmittance=replace(base.transmittance, wall=WallSettings(light="fresnel", **changes)),  # type: ignore[arg-type]
+    )
 
 
 def new_glass_method(

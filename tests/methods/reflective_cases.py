@@ -100,3 +100,11 @@ def use(method: Model, settings: MethodSettings) -> None:
     """From now on the method renders with these settings."""
     for part in method.parts.values():
         part.settings = settings
+
+
+def train_step(method: Model, made, step: int):
+    view = made.scene.train[step % len(made.scene.train)]
+    rendered = method.render(view.camera, step, Mode.TRAIN)
+    terms = method.losses(rendered, view, step)
+    terms.total.backward()
+    return terms, method.after_step(step, rendered.observations)

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from glass_cases import GlassScene, begun, glass_recipe, glass_scene, train_stages
+from glass_cases import GlassScene, begun, fresnel, glass_recipe, glass_scene, train_stages
 from torch import Tensor
 
 from rtgs.core.errors import RtgsError
@@ -15,7 +15,6 @@ from rtgs.mesh.inner_paths import InnerPaths, Leg
 from rtgs.methods import Mode, RenderOptions
 from rtgs.methods.model import Model
 from rtgs.methods.parts.glass import Glass
-from rtgs.methods.settings import MethodSettings
 from rtgs.methods.shading.inner import TracedLeg, far_wall, inner_light
 from rtgs.optics.dielectric import wall_reflectance
 from rtgs.optics.light import decoded, encoded
@@ -90,16 +89,6 @@ def test_every_gradient_is_right():
 @pytest.fixture(scope="module")
 def made() -> GlassScene:
     return glass_scene()
-
-
-def fresnel(**changes: object) -> MethodSettings:
-    base = glass_recipe(normal="mesh")
-    return replace(
-        base,
-        optics=replace(base.optics, blend="linear"),
-        loss=replace(base.loss, clipped=True),
-        transmittance=replace(base.transmittance, wall=WallSettings(light="fresnel", **changes)),  # type: ignore[arg-type]
-    )
 
 
 def shown(method: Model, made: GlassScene):

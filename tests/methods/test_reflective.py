@@ -12,14 +12,13 @@ from pathlib import Path
 
 import pytest
 import torch
-from reflective_cases import SAMPLED, new_method, recipe, schedule, tiny, train_all, use
+from reflective_cases import SAMPLED, new_method, recipe, schedule, tiny, train_all, train_step, use
 from safetensors.torch import load_file
 
 from rtgs.config import compose
 from rtgs.gaussians.materials import MATERIAL_NAMES, has_materials
 from rtgs.gaussians.settings import MaterialSettings
 from rtgs.methods import Mode, RenderOptions, Stage
-from rtgs.methods.model import Model
 from rtgs.methods.parts.reflection_init import reflection_box, reflection_surfels, scene_color
 from rtgs.methods.settings import (
     MatteSettings,
@@ -43,14 +42,6 @@ def in_second_stage(settings: MethodSettings | None = None, *, steps: int = 0, s
     for step in range(15, 15 + steps):
         train_step(method, made, step)
     return method, made
-
-
-def train_step(method: Model, made, step: int):
-    view = made.scene.train[step % len(made.scene.train)]
-    rendered = method.render(view.camera, step, Mode.TRAIN)
-    terms = method.losses(rendered, view, step)
-    terms.total.backward()
-    return terms, method.after_step(step, rendered.observations)
 
 
 def test_the_first_stage_is_that_of_the_plain_method_and_the_second_adds_what_it_needs():

@@ -1,10 +1,14 @@
 """The two lights in which colours may be mixed."""
 
+from collections.abc import Iterator
+
 import numpy as np
+import pytest
 import torch
 
 from rtgs.methods.shading.mirror import SurfacePixels, specular_change
-from rtgs.optics.light import decoded, encoded
+from rtgs.native import core
+from rtgs.optics.light import decoded, decoded_twin, encoded, encoded_twin
 from rtgs.scenes.truth import srgb_from_linear
 
 
@@ -30,3 +34,55 @@ def test_a_half_mirror_of_white_over_black_is_half_the_light():
     white = torch.ones(3, 1)
     assert float(specular_change(pixels, white, None)[0]) == 0.5
     assert abs(float(specular_change(pixels, white, None, "linear")[0]) - 0.735357) < 1e-5, "sRGB of half the light"
+
+
+@pytest.fixture(params=core.available_isas())
+def isa(request: pytest.FixtureRequest) -> Iterator[str]:
+    before = core.isa()
+    core.select_isa(request.param)
+    yield request.param
+    core.select_isa(before)
+
+
+@pytest.mark.usefixtures("isa")
+@pytest.mark.parametrize(("native", "twin"), [(decoded, decoded_twin), (encoded, encoded_twin)])
+@pytest.mark.parametrize("count", [0, 1, 15, 16, 33, 20_001])
+def test_native_curves_and_their_gradients_are_those_of_the_twins(native, twin, count: int):
+    given = torch.cat((torch.linspace(-0.2, 3, count), torch.tensor([0.0404, 0.0405, 0.00313, 0.00314, 50.0])))
+    found, exact = given.clone().requires_grad_(), given.double().requires_grad_()
+    values, expected = native(found, "linear"), twin(exact)
+    upstream = torch.randn(len(given), generator=torch.Generator().manual_seed(1))
+    values.backward(upstream)
+    expected.backward(upstream.double())
+    torch.testing.assert_close(values.double(), expected, rtol=2e-6, atol=1e-7)
+    assert found.grad is not None
+    torch.testing.assert_close(found.grad.double(), exact.grad, rtol=2e-6, atol=1e-7)
+
+
+@pytest.mark.usefixtures("isa")
+@pytest.mark.parametrize("curve", [decoded, encoded])
+def test_not_a_number_is_handed_on_and_nothing_else_becomes_one(curve):
+    given = torch.tensor([float("nan"), float("inf"), -float("inf"), 3e38, -3e38, 1e-42, 0.0, -0.0])
+    found = curve(given, "linear")
+    assert found[0].isnan()
+    assert not found[1:].isnan().any()
+    assert float(found[1]) > 1e8
+
+
+@pytest.mark.parametrize("curve", [decoded, encoded])
+def test_threads_change_no_bit(curve):
+    given = 2 * torch.rand(3, 40_001, generator=torch.Generator().manual_seed(0))
+    before, found = torch.get_num_threads(), []
+    for threads in (1, 2, 3):
+        torch.set_num_threads(threads)
+        leaf = given.clone().requires_grad_()
+        result = curve(leaf, "linear")
+        result.sum().backward()
+        found.append((result.detach(), leaf.grad))
+    torch.set_num_threads(before)
+    assert all(torch.equal(one, other) for each in found[1:] for one, other in zip(found[0], each, strict=True))
+
+
+def test_other_sizes_are_refused():
+    with pytest.raises(ValueError, match="as many numbers must come out as go in"):
+        core.srgb_decode(torch.zeros(3).numpy(), torch.zeros(4).numpy(), 1)

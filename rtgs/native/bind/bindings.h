@@ -18,6 +18,7 @@ void bind_ellipsoids(nb::module_& m);
 void bind_image(nb::module_& m);
 void bind_optimizer(nb::module_& m);
 void bind_mirror(nb::module_& m);
+void bind_srgb(nb::module_& m);
 void bind_surfels(nb::module_& m);
 void bind_trace(nb::module_& m);
 }  // namespace rtgs

@@ -9,6 +9,7 @@ NB_MODULE(_core, m) {
   rtgs::bind_surfels(m);
   rtgs::bind_optimizer(m);
   rtgs::bind_mirror(m);
+  rtgs::bind_srgb(m);
   rtgs::bind_raster(m);
   rtgs::bind_ellipsoids(m);
   rtgs::bind_trace(m);
