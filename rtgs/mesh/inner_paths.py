@@ -31,6 +31,7 @@ class Leg:
     direction: Tensor  # (L, 3) float32 unit
     length: Tensor  # (L,) float32 world units to the next wall; 0 where the mesh has none
     cosine: Tensor  # (L,) float32 of the angle of incidence there; 1 where there is no wall, 0 where it is no glass
+    wall: Tensor  # (L,) float32: 1; 0 where nothing reflects: there is no wall, or an opening
 
     @property
     def exit(self) -> Tensor:
@@ -39,7 +40,8 @@ class Leg:
 
     def rows(self, chosen: Tensor, parent: Tensor) -> Leg:
         """The stretches ``chosen`` (int64), with other parents."""
-        return Leg(parent, *(each[chosen] for each in (self.origin, self.direction, self.length, self.cosine)))
+        values = (self.origin, self.direction, self.length, self.cosine, self.wall)
+        return Leg(parent, *(each[chosen] for each in values))
 
 
 @dataclass(frozen=True)
@@ -75,14 +77,15 @@ class InnerGuide:
     """The paths of each camera; those of the last cameras are remembered, up to ``CACHED_BYTES``.
 
     ``bounces``: reflections inside the object that are followed, at least 1. ``glass`` (F,) bool: faces that are glass;
-    light is mirrored at no others.
+    light is mirrored at no others. ``opened`` (F,) bool: those that are no wall at all; None: there are none.
     """
 
-    def __init__(self, mesh: ObjectMesh, glass: Tensor, bounces: int) -> None:
+    def __init__(self, mesh: ObjectMesh, glass: Tensor, bounces: int, opened: Tensor | None = None) -> None:
         if bounces < 1:
             raise ValueError(f"bounces is {bounces}: at least 1 reflection inside the object is followed")
         self.mesh, self.bounces = mesh, bounces
-        self._glass = glass.numpy()
+        self._open = np.zeros(len(glass), bool) if opened is None else opened.numpy()
+        self._glass = glass.numpy() & ~self._open
         size = float(np.linalg.norm(mesh.bounds[1] - mesh.bounds[0]))
         self._off, self._nearest = OFF_THE_WALL * size, 0.5 * mesh.voxel
         self._cache: dict[tuple[object, ...], InnerPaths] = {}
@@ -131,8 +134,10 @@ class InnerGuide:
         cosine = np.where(there, -(inward * mirrored).sum(1), 1.0)
         goes_on = there.copy()
         goes_on[there] &= self._glass[triangle[there]]
-        cosine[there & ~goes_on] = 0.0  # a label or a lid lets nothing through
-        leg = Leg(torch.from_numpy(parent), _float(points), _float(mirrored), _float(length), _float(cosine))
+        wall = there.copy()
+        wall[there] &= ~self._open[triangle[there]]
+        cosine[wall & ~goes_on] = 0.0  # a label or a lid lets nothing through
+        leg = Leg(torch.from_numpy(parent), *(_float(each) for each in (points, mirrored, length, cosine, wall)))
         return leg, ends, mirrored, inward, np.flatnonzero(goes_on)
 
     def _first(self, hits: RayHits) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

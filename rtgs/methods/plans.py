@@ -83,6 +83,7 @@ class TransmittancePlan:
     """When the third stage does what (method.md 6.2)."""
 
     start: int  # first step with straight rays
+    judged: int  # before this step it is judged where the object is open; ``start``: it never is
     own: ScheduleSettings  # of the transmittance set on its own clock, which is 0 at ``start``
     base: ScheduleSettings  # of the base set in a run with this stage
 
@@ -107,4 +108,6 @@ def transmittance_plan(settings: TransmittanceSettings, schedule: ScheduleSettin
         means_lr_steps=min(schedule.means_lr_steps, length),
     )
     base = replace(schedule, densify_until=min(schedule.densify_until, start)) if settings.freeze_base else schedule
-    return TransmittancePlan(start, own, base)
+    share = settings.wall.openings if settings.wall.light == "fresnel" else 0.0
+    judged = start + max(round(share * length), 1) if share > 0 else start
+    return TransmittancePlan(start, judged, own, base)

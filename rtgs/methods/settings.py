@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from rtgs.core.errors import RtgsError
+from rtgs.core.recipe import UNLESS_DEFAULT
 from rtgs.core.refuse import refuse_bad_numbers, refuse_unknown_words, refuse_unless
 from rtgs.gaussians.settings import DensitySettings, InitSettings, MaterialSettings, OptimizerSettings
 from rtgs.optics.settings import OpticsSettings, WallSettings
@@ -210,6 +211,9 @@ class TransmittanceSettings:
     # Share of the masked pixels whose base depth is the object's first surface; with more the object is opaque and the
     # stage left out (docs/lab/transmittance.md: thin glass 0.05 to 0.5). 1: never.
     opaque_share: float = 0.9
+    # Base surfels in the object begin as its contents with an opacity of at most this, so that light can take the place
+    # of those that stood for it (docs/lab/glass_light.md). 1: as they are.
+    start_opacity: float = field(default=1.0, metadata=UNLESS_DEFAULT)
     keep_seen: int = 3  # views that see a surfel bare, from which on it stays in the base set too; 0: all go
     sh_degree: int = 3  # of the transmittance set, at most
     split: bool = True  # base surfels inside the mesh become the transmittance set; the paper: a random set (False)
@@ -240,6 +244,8 @@ class TransmittanceSettings:
     def __post_init__(self) -> None:
         refuse_bad_numbers(self, "method.transmittance")
         refuse_unknown_words(self, "method.transmittance")
+        key = "method.transmittance.start_opacity"
+        refuse_unless(0 < self.start_opacity <= 1, key, self.start_opacity, "above 0 and at most 1")
         for name in ("start", "densify_until"):
             value = getattr(self, name)
             refuse_unless(0 <= value <= 1, f"method.transmittance.{name}", value, "between 0 and 1")

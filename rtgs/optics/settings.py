@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
+from rtgs.core.recipe import UNLESS_DEFAULT
 from rtgs.core.refuse import refuse_bad_numbers, refuse_unknown_words, refuse_unless
 
 Weight = Literal["microfacet", "literal", "split_sum", "envgs"]
@@ -57,6 +58,10 @@ class WallSettings:
     index: float = 1.5  # of refraction, at the start; window glass 1.52, borosilicate 1.47
     index_rate: float = 0.0  # of Adam, for the whole object; 0: the index stays
     bounces: int = 1  # reflections inside the object that are followed; 0: none
+    # Share of the third stage after which parts of the mesh between creases are judged from training views: walls or
+    # openings, as that of a cup (docs/glass_light.md). 0: all are walls.
+    openings: float = field(default=0.0, metadata=UNLESS_DEFAULT)
+    opening_gain: float = field(default=0.02, metadata=UNLESS_DEFAULT)  # fall of the squared error there, at least
     cover: float = 0.9  # a composited k_s from which on a pixel is all glass: what L_spec asks of the interface
 
     def __post_init__(self) -> None:
@@ -64,4 +69,7 @@ class WallSettings:
         refuse_bad_numbers(self, "method.transmittance.wall")
         refuse_unless(1.05 <= self.index <= 2.5, "method.transmittance.wall.index", self.index, "between 1.05 and 2.5")
         refuse_unless(self.bounces >= 0, "method.transmittance.wall.bounces", self.bounces, "at least 0 (0: none)")
+        refuse_unless(
+            0 <= self.openings < 1, "method.transmittance.wall.openings", self.openings, "between 0 (never) and 1"
+        )
         refuse_unless(0 < self.cover <= 1, "method.transmittance.wall.cover", self.cover, "above 0 and at most 1")

@@ -138,4 +138,18 @@ def test_a_leg_that_finds_no_wall_has_no_length():
     lost = leg.length == 0
     assert 0 < int(lost.sum()) < len(lost)
     assert bool((leg.cosine[lost] == 1).all())
+    assert torch.equal(leg.wall == 0, lost)
     assert bool(np.isfinite(leg.exit.numpy()).all())
+
+
+def test_an_opening_ends_a_path_and_reflects_nothing(ball: ObjectMesh):
+    every = torch.ones(len(ball.mesh.faces), dtype=torch.bool)
+    opened = torch.from_numpy(ball.mesh.vertices[ball.mesh.faces].mean(1)[:, 0] > 0)  # the right half
+    found = InnerGuide(ball, every, 2, opened).paths(camera(), ObjectGuide(ball))
+    first, second = found.legs
+    assert float(first.origin[:, 0].max()) < 0.02, "nothing is mirrored at the opening"
+    leaves = first.wall == 0
+    assert 0 < int(leaves.sum()) < len(leaves)
+    assert bool((first.exit[leaves, 0] > -0.02).all())
+    assert bool((first.cosine[leaves] > 0).all()), "it lets light through"
+    assert not bool(leaves[second.parent].any())

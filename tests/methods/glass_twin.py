@@ -161,7 +161,7 @@ class GlassTwin:
     def _along(self, every: InnerPaths, found: list[Tensor], level: int, row: int) -> Tensor:
         """(3,) light that arrives along one leg: contents over what comes through the wall and what it mirrors."""
         leg, met = every.legs[level], found[level][row]
-        wall = thin_wall(leg.cosine[row], self.settings.wall.index)
+        wall = leg.wall[row] * thin_wall(leg.cosine[row], self.settings.wall.index)
         light = (1 - wall) * to_linear(met[4:])
         if level + 1 < len(found):
             on = (every.legs[level + 1].parent == row).nonzero()[:, 0]

@@ -27,7 +27,7 @@ STEP = 40
 def chain(count: int, bounces: int, cosine: float = 0.7) -> InnerPaths:
     """Paths in a ball: the same angle at every wall."""
     rows, ones = torch.arange(count), torch.ones(count, dtype=torch.float64)
-    leg = Leg(rows, torch.zeros(count, 3), torch.zeros(count, 3), ones, cosine * ones)
+    leg = Leg(rows, torch.zeros(count, 3), torch.zeros(count, 3), ones, cosine * ones, ones)
     return InnerPaths(rows, cosine * ones, (leg,) * bounces)
 
 

@@ -73,6 +73,20 @@ def test_the_base_set_is_split_by_the_mesh(made: GlassScene):
     assert float(method.find("interface").gaussians.opacity_logits.detach().sigmoid().min()) == pytest.approx(0.95)
 
 
+def test_contents_begin_no_more_opaque_than_asked(made: GlassScene):
+    settings = glass_recipe()
+    as_found, faint = (
+        begun(replace(settings, transmittance=replace(settings.transmittance, start_opacity=most)), made)
+        for most in (1.0, 0.07)
+    )
+    before, after = (each["transmittance"].gaussians.opacity_logits.detach().sigmoid() for each in (as_found, faint))
+    assert float(before.max()) > 0.07
+    torch.testing.assert_close(after, before.clamp_max(0.07))
+    assert torch.equal(faint["base"].gaussians.opacity_logits, as_found["base"].gaussians.opacity_logits)
+    with pytest.raises(RtgsError, match=r"transmittance\.start_opacity=0\.0 must be above 0 and at most 1"):
+        replace(settings.transmittance, start_opacity=0.0)
+
+
 def test_the_set_behind_glass_can_learn_faster_than_the_base(made: GlassScene):
     recipe = glass_recipe()
     method = begun(replace(recipe, transmittance=replace(recipe.transmittance, rate_gain=3.0)), made)

@@ -21,7 +21,7 @@ from rtgs.methods.parts.kinds import GaussianKind, RasterRequest
 from rtgs.methods.parts.part import Frame, Part, Raster, Rows
 from rtgs.methods.shading.diffuse import diffuse
 from rtgs.render.features import named_features
-from rtgs.train.method import Observation, RenderedView, RenderOptions, StepEvent
+from rtgs.train.method import Mode, Observation, RenderedView, RenderOptions, StepEvent
 from rtgs.train.schedule import (
     check_schedule,
     densify_ahead,
@@ -142,6 +142,14 @@ class BaseSet(Part):
         plain = RasterRequest(camera, RenderOptions(), False, None, torch.zeros(3), self.settings.render, self.extent)
         buffers = self.kind.rasterize(rows, features, plain)
         return buffers.features[0], buffers.alpha
+
+    @torch.no_grad()
+    def median_depth(self, camera: Camera, step: int) -> Tensor:
+        """(H, W) z-depth of what is opaque in each pixel, 0 where nothing is."""
+        wanted = RenderOptions(median_depth=True)
+        found = self.rasterize(Frame(camera, step, Mode.EVALUATE, wanted), wanted).buffers.median_depth
+        assert found is not None
+        return found
 
     def _normal_residual(self, more: int) -> Tensor | None:
         """That of the set's channel, and 0 for ``more`` rows behind it."""

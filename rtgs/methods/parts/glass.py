@@ -112,7 +112,7 @@ class Glass(Part):
     @property
     def decisions(self) -> tuple[Decision, ...]:
         if self._left_out is None:
-            return ()
+            return () if self.wall is None else self.wall.decisions
         why = "the masks of the training views are empty, or cover all of them"
         if self._left_out != NOT_MASKED:
             why = f"the masked object looks opaque: {self._left_out:.1%} of what its pixels show is its own surface "
@@ -153,7 +153,7 @@ class Glass(Part):
         transmittance = self.settings.transmittance
         if transmittance.first_bounce != "transmittance" or transmittance.second_bounce == "none":
             walls = replace(walls, bounces=0)  # the set that it would be followed through, or the far wall, is missing
-        self.wall = WallLight(walls, self.guide, self._glass) if walls.light == "fresnel" else None
+        self.wall = WallLight(walls, self.guide, self._glass, self._views) if walls.light == "fresnel" else None
 
     def _add_interface(self, mesh: ObjectMesh) -> StepEvent:
         gaussians = self.base.set.gaussians
@@ -192,16 +192,8 @@ class Glass(Part):
         if settings.keep_seen == 0 or not settings.split:
             return torch.zeros(len(self.base.set), dtype=torch.bool)
         means = self.base.set.gaussians.means.detach()
-        counts = seen_bare(means, self._views, lambda camera: self._opaque(camera, step))
+        counts = seen_bare(means, self._views, lambda camera: self.base.median_depth(camera, step))
         return counts >= settings.keep_seen
-
-    @torch.no_grad()
-    def _opaque(self, camera: Camera, step: int) -> Tensor:
-        """(H, W) median depth of the base set."""
-        wanted = RenderOptions(median_depth=True)
-        found = self.base.rasterize(Frame(camera, step, Mode.EVALUATE, wanted), wanted).buffers.median_depth
-        assert found is not None
-        return found
 
     def _add_transmittance(self, mesh: ObjectMesh, kept: Tensor) -> StepEvent:
         cameras = [view.camera for view in self._views]
@@ -233,9 +225,11 @@ class Glass(Part):
         straight = glass_rays(glass, chosen.index, rays.center, rays.directions)
         inner = None
         if self.wall is not None:
+            if frame.step < self.plan.judged:
+                self.wall.probe(frame.step if frame.training else None)
             inner = self.wall.inner_rays(frame.camera, straight, chosen.index[straight.rows])
         met = mirror.reflect(frame, chosen, glass.flat, None if inner is None else inner.leaving)
-        reflection, transmission = self.weights(met, glass.inside[chosen.index])
+        reflection, transmission = self.weights(met, glass.inside[chosen.index], frame.camera, chosen.index)
         passed = self.transmit(frame, straight, inner, met.others)
         through = Light("transmission", "transmitted_color", transmission, passed.color, passed.parts)
         traced = Traced(
@@ -283,13 +277,15 @@ class Glass(Part):
         """(H, W) bool: the mesh's first surface is one of the object's, not a lid or a label."""
         return surfaces.hit & self._glass[surfaces.triangle.clamp_min(0).long()]
 
-    def weights(self, met: Reflected, inside: Tensor) -> tuple[Tensor, Tensor]:
-        """w_r and w_t of the traced pixels, with the S_max and the bound of the object's; ``inside`` (P,) bool."""
+    def weights(self, met: Reflected, inside: Tensor, camera: Camera, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        """w_r and w_t of the traced ``pixels`` (P,), with the S_max and the bound of the object's; ``inside`` (P,)
+        bool."""
         settings, optics = self.settings.transmittance, self.settings.optics
         bounded = settings.max_weight > 0 and settings.interface.count > 0
         cosine, reflection = met.rays.cosine, reflected_weight(met.rays.cosine, met.pixels, optics)
         if self.wall is not None:
-            return self.wall.weights(reflection, cosine, inside.nonzero()[:, 0])
+            rows = inside.nonzero()[:, 0]
+            return self.wall.weights(reflection, cosine, rows, self.wall.walls(camera, pixels[rows]))
         optics = optics if settings.max_gain is None else replace(optics, max_gain=settings.max_gain)
         return glass_weights(reflection, cosine, met.pixels, inside, optics, settings.max_weight if bounded else 0.0)
 
@@ -339,6 +335,20 @@ class Glass(Part):
             clock = self.plan.clock(step)
             self.transmittance.step(clock, self._own_degree(step), observations.get(self.transmittance.name))
 
+    def judge(self, following: int) -> Iterator[StepEvent]:
+        """Look at some training views: where is the object open?"""
+        if self.wall is None or not self.plan.start < following == self.plan.judged < self.schedule.total:
+            return
+        if found := self.wall.judge(lambda view: self._look(view, following).image):
+            yield StepEvent("decision", "transmittance", f"openings of the object: {found}")
+
+    def _look(self, view: View, step: int) -> RenderedView:
+        frame = Frame(view.camera, step, Mode.EVALUATE, RenderOptions(masks="given"), view.mask)
+        more = () if (rows := self.appended(frame)) is None else (rows,)
+        shaded = self.shade(frame, self.base.rasterize(frame, frame.options.plus(self.mirror.needs(frame)), more))
+        assert shaded is not None
+        return shaded
+
     def control(self, following: int) -> Iterator[StepEvent]:
         """Density control of the transmittance set on its own clock."""
         if self.transmittance is None:
@@ -359,7 +369,9 @@ class Glass(Part):
             return {_LEFT_OUT: torch.tensor([self._left_out])}
         if not self.begun:
             return {}
-        return {_BEGUN: torch.tensor([self._from_base], dtype=torch.uint8), _GLASS: self._glass.to(torch.uint8)}
+        walls = {} if self.wall is None else self.wall.state()
+        begun = torch.tensor([self._from_base], dtype=torch.uint8)
+        return {_BEGUN: begun, _GLASS: self._glass.to(torch.uint8), **walls}
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
         """The stage as far as the state has it."""
@@ -368,6 +380,8 @@ class Glass(Part):
         self._glass = state[_GLASS].bool() if self.begun else self._glass
         if self.begun:
             self._put_walls()
+            if self.wall is not None:
+                self.wall.restore(state)
         if _LEFT_OUT in state and self._left_out is None:
             self._leave_out(float(state[_LEFT_OUT]))
         own = stored_surfels(state, "transmittance")

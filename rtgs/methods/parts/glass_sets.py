@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -50,7 +51,11 @@ def taken_from_base(
     elif both := int((inside & kept).sum()):
         detail += f", {both} of them seen bare too: they also stay in the base set"
     kept = torch.ones_like(kept) if mesh.flat else kept  # what is behind a pane is seen beside it, too
-    return Taken(take_out(base, inside, kept), found, False, detail)
+    taken = take_out(base, inside, kept)
+    if transmittance.start_opacity < 1:
+        with torch.no_grad():
+            taken.opacity_logits.clamp_(max=math.log(transmittance.start_opacity / (1 - transmittance.start_opacity)))
+    return Taken(taken, found, False, detail)
 
 
 def drawn_in_box(

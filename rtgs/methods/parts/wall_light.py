@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from rtgs.core.cameras import Camera
+from rtgs.core.decisions import Decision
 from rtgs.mesh.container import ObjectGuide
 from rtgs.mesh.inner_paths import InnerGuide, InnerPaths
+from rtgs.methods.parts.openings import Openings, judged_openings, upward_parts
 from rtgs.methods.shading.straight import GlassPixels, GlassRays
 from rtgs.optics.dielectric import wall_reflectance
 from rtgs.optics.settings import WallSettings
 from rtgs.train.parameters import ParameterGroup, Rate
+
+if TYPE_CHECKING:
+    from rtgs.scenes.scene import View
 
 INDEX_LIMITS = (1.05, 2.5)
 
@@ -43,15 +51,80 @@ class WallLight:
         group: the index of refraction, where it is learned; None: it stays.
     """
 
-    def __init__(self, settings: WallSettings, guide: ObjectGuide, glass: Tensor) -> None:
+    def __init__(self, settings: WallSettings, guide: ObjectGuide, glass: Tensor, views: Sequence[View]) -> None:
         self.settings = settings
         self._guide = guide
-        follow = settings.bounces > 0 and not guide.mesh.flat
-        self._inner = InnerGuide(guide.mesh, glass, settings.bounces) if follow else None
+        self._glass = glass
+        self._views = views
+        self._openings: Openings | None = None
+        self._opened: Tensor | None = None
+        self._inner: InnerGuide | None = None
+        self._guides: dict[bytes, InnerGuide] = {}
+        self._follow = settings.bounces > 0 and not guide.mesh.flat
+        self._open(torch.zeros_like(glass))
         self.group: ParameterGroup | None = None
         if settings.index_rate > 0:
             index = {"index": torch.tensor([settings.index])}
             self.group = ParameterGroup("glass", index, Rate(settings.index_rate), limits=INDEX_LIMITS)
+
+    def probe(self, step: int | None) -> None:
+        """Before it is judged, parts that may be openings are walls in even steps and openings in odd ones; None: they
+        are walls."""
+        self._open(self._upward if step is not None and step % 2 else torch.zeros_like(self._glass))
+
+    @cached_property
+    def _parts(self) -> list[Tensor]:
+        return upward_parts(self._guide.mesh, self._views)
+
+    @cached_property
+    def _upward(self) -> Tensor:
+        """(F,) bool: in any of the parts."""
+        return torch.stack([torch.zeros_like(self._glass), *self._parts]).any(0)
+
+    @property
+    def decisions(self) -> tuple[Decision, ...]:
+        """Where the object is open."""
+        return () if self._openings is None else self._openings.decisions
+
+    def judge(self, look: Callable[[View], Tensor]) -> Openings | None:
+        """Find the object's openings; ``look`` gives the picture of a view as the walls are. None: there is no part
+        to judge."""
+
+        def shown(view: View, opened: Tensor) -> Tensor:
+            self._open(opened)
+            return look(view)
+
+        self._adopt(judged_openings(self._guide, self._parts, self._views, shown, self.settings.opening_gain))
+        return self._openings
+
+    def state(self) -> dict[str, Tensor]:
+        """For a checkpoint: what was judged."""
+        return {} if self._openings is None else self._openings.state()
+
+    def restore(self, state: Mapping[str, Tensor]) -> None:
+        """What was judged, from a checkpoint's state."""
+        self._adopt(Openings.of(state, self.settings.opening_gain))
+
+    def _adopt(self, found: Openings | None) -> None:
+        self._openings = found
+        self._open(torch.zeros_like(self._glass) if found is None else found.faces)
+
+    def _open(self, faces: Tensor) -> None:
+        """Faces (F,) bool of the mesh are openings, where no wall is; all others are walls."""
+        if self._opened is not None and torch.equal(self._opened, faces):
+            return
+        self._opened = faces
+        if self._follow:
+            key = faces.numpy().tobytes()
+            before = self._guides.pop(key, None)
+            self._inner = before or InnerGuide(self._guide.mesh, self._glass, self.settings.bounces, faces)
+            self._guides = {**dict([*self._guides.items()][-1:]), key: self._inner}  # the last two
+
+    def walls(self, camera: Camera, pixels: Tensor) -> Tensor:
+        """(P,) float32 of flattened pixels (P,): 1, or 0 where the object's first surface is an opening."""
+        assert self._opened is not None
+        triangle = self._guide.surfaces(camera).triangle.flatten()[pixels].long()
+        return 1 - (self._opened[triangle.clamp_min(0)] & (triangle >= 0)).float()
 
     @property
     def index(self) -> Tensor | float:
@@ -65,9 +138,10 @@ class WallLight:
         specular = torch.where(glass.known, specular, glass.flat.specular)
         return replace(glass, flat=replace(glass.flat, specular=specular))
 
-    def weights(self, reflection: Tensor, cosine: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """w_r and w_t of P traced pixels: R and 1 - R in ``rows``, elsewhere ``reflection`` (P,) or (3, P), and 0."""
-        reflected = wall_reflectance(cosine.index_select(0, rows), self.index)
+    def weights(self, reflection: Tensor, cosine: Tensor, rows: Tensor, walls: Tensor) -> tuple[Tensor, Tensor]:
+        """w_r and w_t of P traced pixels: R and 1 - R in ``rows``, elsewhere ``reflection`` (P,) or (3, P), and 0.
+        ``walls``: of these rows, as :meth:`walls` has them; R is 0 where there is none."""
+        reflected = walls * wall_reflectance(cosine.index_select(0, rows), self.index)
         full = reflected.expand(*reflection.shape[:-1], -1)
         passed = torch.zeros_like(reflection).index_copy(-1, rows, 1 - full)
         return reflection.index_copy(-1, rows, full), passed

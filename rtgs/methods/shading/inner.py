@@ -36,7 +36,7 @@ def inner_light(paths: InnerPaths, traced: Sequence[TracedLeg], index: Tensor | 
     arriving: Tensor | None = None
     for k in reversed(range(len(traced))):
         leg, met = paths.legs[k], traced[k]
-        reflected = wall_reflectance(leg.cosine.to(met.alpha.dtype), index)[:, None]
+        reflected = (leg.wall * wall_reflectance(leg.cosine.to(met.alpha.dtype), index))[:, None]
         light = (1 - reflected) * decoded(met.surroundings, LINEAR)
         if arriving is not None:
             later = torch.zeros_like(light).index_copy(0, paths.legs[k + 1].parent, arriving)

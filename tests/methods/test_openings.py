@@ -1,0 +1,226 @@
+"""Openings of an object: what is judged, what an opening does to light, that a run goes on with it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from glass_cases import GlassScene, begun, fresnel, glass_scene, train_stages
+from torch import Tensor
+
+from benchmarks.common.mirror_scene import BALL, RADIUS
+from rtgs.core.errors import RtgsError
+from rtgs.mesh.container import ObjectGuide, ObjectMesh
+from rtgs.mesh.lathe import Axis, lathe
+from rtgs.mesh.panels import parts_between_creases
+from rtgs.methods import Mode, RenderOptions
+from rtgs.methods.parts import wall_light
+from rtgs.methods.parts.glass import Glass
+from rtgs.methods.parts.openings import Openings, judged_openings, upward_parts
+from rtgs.scenes.scene import View
+
+VOXEL = 0.02
+STEP = 40
+AXIS = Axis.along(BALL.double().numpy(), np.array([1.0, 0.3, 0.2]))  # lying: the cameras are all around
+
+
+def cup() -> ObjectMesh:
+    """A closed cylinder where the glass ball is: what a hull makes of a cup."""
+    half, side = 0.6 * RADIUS, np.arange(-0.6 * RADIUS, 0.6 * RADIUS, 0.5 * VOXEL)
+    radii = np.arange(0, half, 0.5 * VOXEL)
+    profile = np.concatenate(
+        [
+            np.stack([radii, np.full_like(radii, -half)], axis=1),
+            np.stack([np.full_like(side, half), side], axis=1),
+            np.stack([np.append(half, radii[::-1]), np.full(len(radii) + 1, half)], axis=1),
+        ]
+    )
+    return ObjectMesh(lathe(profile, AXIS, 64), "given", voxel=VOXEL, flat=False)
+
+
+@pytest.fixture(scope="module")
+def made() -> GlassScene:
+    scene = glass_scene(8, 64, 48).scene
+    mesh = cup()
+    guide = ObjectGuide(mesh)
+    views = tuple(replace(view, mask=guide.surfaces(view.camera).hit) for view in scene.train)
+    return GlassScene(replace(scene, train=views), mesh)
+
+
+def ends(mesh: ObjectMesh) -> tuple[Tensor, Tensor]:
+    """(F,) bool: faces of the upper end, of the lower one."""
+    normal = torch.from_numpy(mesh.mesh.face_normals())
+    upright = normal @ torch.from_numpy(AXIS.frame[2]) / normal.norm(dim=1).clamp_min(1e-12)
+    return upright > 0.9, upright < -0.9
+
+
+def test_a_part_is_open_where_photos_are_met_better_without_a_wall(made: GlassScene):
+    guide = ObjectGuide(made.mesh)
+    up, down = ends(made.mesh)
+    _, *parts = (torch.from_numpy(part) for part in parts_between_creases(made.mesh.mesh, VOXEL))
+    assert len(parts) == 2
+
+    def shown(view: View, opened: Tensor) -> Tensor:
+        """Off by .1 where the upper end is a wall, and where the lower one is none."""
+        surfaces = guide.surfaces(view.camera)
+        first = surfaces.triangle.clamp_min(0).long()
+        wrong = surfaces.hit & ((up & ~opened)[first] | (down & opened)[first])
+        shift = torch.where(wrong, 0.1, 0.05)
+        return view.image + torch.where(view.image > 0.5, -shift, shift)
+
+    found = judged_openings(guide, parts, made.scene.train, shown, 0.02)
+    assert found is not None
+    assert len(found.found) == 2
+    assert bool((found.faces & up).any())
+    assert not bool((found.faces & ~up).any())
+    assert float(found.faces.sum()) > 0.8 * float(up.sum()), "all of it but its crease"
+    gains = sorted(found.found[:, 1].tolist())
+    assert gains == pytest.approx([-3.0, 0.75])
+    (decision,) = found.decisions
+    assert "the error there falls by 75%" in decision.why
+    again = Openings.of(found.state(), 0.02)
+    assert again is not None
+    assert torch.equal(again.faces, found.faces)
+    assert not bool(Openings(found.part, found.found, 0.8).faces.any()), "a gain below what is asked for"
+
+
+def looking_along(view: View, up: Tensor) -> View:
+    """The view's camera turned so that ``up`` (3,) is upward in the picture."""
+    across = torch.linalg.cross(up, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+    across /= across.norm()
+    rotation = torch.stack([across, -up, torch.linalg.cross(across, -up)])
+    return replace(view, camera=replace(view.camera, rotation=rotation))
+
+
+def test_nothing_is_judged_that_has_no_part_or_no_view(made: GlassScene):
+    def shown(view: View, opened: Tensor) -> Tensor:
+        raise AssertionError("no picture is made in vain")
+
+    assert judged_openings(ObjectGuide(made.mesh), [], made.scene.train, shown, 0.02) is None
+    blind = [replace(view, mask=None) for view in made.scene.train]
+    assert judged_openings(ObjectGuide(made.mesh), list(ends(made.mesh)), blind, shown, 0.02) is None
+
+
+def test_what_looks_up_may_be_open(made: GlassScene):
+    up, down = ends(made.mesh)
+    assert upward_parts(made.mesh, made.scene.train) == [], "the cylinder lies"
+    for end, sign in ((up, 1.0), (down, -1.0)):
+        turned = [looking_along(view, sign * torch.from_numpy(AXIS.frame[2])) for view in made.scene.train]
+        (part,) = upward_parts(made.mesh, turned)
+        assert bool(part.any())
+        assert not bool((part & ~end).any())
+    assert upward_parts(glass_scene().mesh, turned) == [], "a ball is one part"
+
+
+def opened(method, faces: Tensor) -> Glass:
+    """The method's glass with these faces as openings."""
+    glass = method.parts["glass"]
+    assert isinstance(glass, Glass)
+    assert glass.wall is not None
+    glass.wall.restore(Openings(faces.to(torch.uint8), torch.tensor([[0.2, 0.5]]), 0.02).state())
+    return glass
+
+
+def test_an_opening_mirrors_nothing_on_either_side(made: GlassScene):
+    method = begun(fresnel(), made)
+    up, _ = ends(made.mesh)
+    first, far = 0, 0
+    for view in made.scene.train:
+        with torch.no_grad():
+            closed = method.render(view.camera, STEP, Mode.EVALUATE, RenderOptions(layers=True), view.mask)
+        glass = opened(method, up)
+        with torch.no_grad():
+            open_ = method.render(view.camera, STEP, Mode.EVALUATE, RenderOptions(layers=True), view.mask)
+        glass.wall.restore({})  # type: ignore[union-attr]
+        assert glass.guide is not None
+        assert closed.layers is not None
+        assert open_.layers is not None
+        surfaces = glass.guide.surfaces(view.camera)
+        through = surfaces.hit & up[surfaces.triangle.clamp_min(0).long()]
+        first += int(through.sum())
+        if through.any():
+            assert float(open_.layers["reflection"][:, through].abs().max()) == 0
+            assert float(closed.layers["reflection"][:, through].max()) > 0.02
+        sides = surfaces.hit & ~through
+        torch.testing.assert_close(open_.layers["reflection"][:, sides], closed.layers["reflection"][:, sides])
+        far += int((open_.layers["inner"] - closed.layers["inner"])[:, sides].abs().amax(0).gt(1e-4).sum())
+    assert first > 100
+    assert far > 20, "light leaves through the opening undimmed, and is not mirrored at it"
+
+
+@pytest.fixture
+def standing(made: GlassScene, monkeypatch: pytest.MonkeyPatch) -> GlassScene:
+    """Where the cylinder's upper end looks up, as far as the judge knows."""
+    up, _ = ends(made.mesh)
+    parts = [torch.from_numpy(part) for part in parts_between_creases(made.mesh.mesh, VOXEL)[1:]]
+    looking_up = [part for part in parts if bool((part & up).any())]
+    monkeypatch.setattr(wall_light, "upward_parts", lambda mesh, views: looking_up)
+    return made
+
+
+def test_before_it_is_judged_a_part_is_open_by_turns_in_training_alone(standing: GlassScene):
+    made = standing
+    method = begun(fresnel(openings=0.5), made)
+    glass = method.parts["glass"]
+    assert isinstance(glass, Glass)
+    up, _ = ends(made.mesh)
+    view = made.scene.train[0]
+    index = torch.arange(view.camera.height * view.camera.width)
+    known = []
+    for step, mode in ((30, Mode.TRAIN), (31, Mode.TRAIN), (31, Mode.EVALUATE), (55, Mode.TRAIN)):
+        with torch.no_grad():
+            method.render(view.camera, step, mode, mask=view.mask)
+        assert glass.wall is not None
+        known.append(bool((glass.wall.walls(view.camera, index) == 0).any()))
+    sees = bool(up[glass.guide.surfaces(view.camera).triangle.clamp_min(0).long()].any())  # type: ignore[union-attr]
+    assert sees
+    assert known == [False, True, False, False]
+
+
+def test_a_run_judges_once_and_goes_on_bit_for_bit(standing: GlassScene):
+    made = standing
+    method = begun(fresnel(openings=0.2), made)
+    glass = method.parts["glass"]
+    assert isinstance(glass, Glass)
+    assert glass.plan.start < glass.plan.judged < 60
+    said = [event for step in range(glass.plan.start + 1, 60) for event in glass.judge(step)]
+    assert len(said) == 1
+    assert said[0].detail.startswith("openings of the object: ")
+    state = {name: value.clone() for name, value in method.state().items()}
+    assert "openings.part" in state
+    other = begun(fresnel(openings=0.2), made)
+    other.load(state)
+    view = made.scene.train[0]
+    for each in (method, other):
+        assert each.decisions == method.decisions
+    with torch.no_grad():
+        images = [each.render(view.camera, STEP, Mode.EVALUATE, mask=view.mask).image for each in (method, other)]
+    assert torch.equal(*images)
+    never = begun(fresnel(), made)
+    assert [event for step in range(60) for event in never.parts["glass"].judge(step)] == []
+
+
+def test_a_trained_run_says_what_was_open(made: GlassScene, monkeypatch: pytest.MonkeyPatch):
+    up, _ = ends(made.mesh)
+    found = Openings(up.to(torch.uint8), torch.tensor([[0.2, 0.5]]), 0.02)
+    monkeypatch.setattr(wall_light, "judged_openings", lambda *given: found)
+    method = begun(fresnel(openings=0.2), made)
+    assert method.decisions == begun(fresnel(), made).decisions
+    train_stages(method, made.scene)
+    assert [each.why for each in method.decisions if each.what == "an opening"] == [
+        "no wall in 20% of the object's mesh: the error there falls by 50%"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"openings": 1.0}, r"wall\.openings=1\.0 must be between 0 \(never\) and 1"),
+        ({"openings": -0.1}, r"wall\.openings=-0\.1 must be"),
+    ],
+)
+def test_settings_that_do_not_fit_are_refused(changes: dict, message: str):
+    with pytest.raises(RtgsError, match=message):
+        fresnel(**changes)
