@@ -28,6 +28,7 @@ from rtgs.config.schema import Choices, RunConfig
 from rtgs.core.decisions import Decision
 from rtgs.methods import find_method
 from rtgs.methods.settings import MethodSettings
+from rtgs.pretrained.keys import ABSENT
 from rtgs.train.settings import ScheduleSettings
 from rtgs.workflow import Step, StepKind
 from rtgs.workflow.fingerprint import flatten
@@ -46,7 +47,6 @@ KINDS: tuple[StepKind, ...] = (
 )
 """Every kind of step there is; the guard against forgotten version bumps goes through them."""
 
-ABSENT = "absent"  # in the place of a network's digest
 _NOT_SHOWN = ("paths.", "tracking.", "table.", "name", "threads", "scene.path", "method.paper_schedule.")
 
 
