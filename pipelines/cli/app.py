@@ -77,6 +77,8 @@ def execute(config: RunConfig, choices: Choices, membership: Membership | None =
     membership.outcomes.check(plan)
     for step in graph.skipped:
         log.info("no %s step: %s", step.what, step.why)
+    for decision in graph.unread:
+        log.info("%s", decision)
     log.info("%s", describe(plan))
     run = _Run(config, choices, plan, command(choices), store, remote, open_tracker(config), membership)
     with _process(None if plan.complete else config):

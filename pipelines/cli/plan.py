@@ -28,7 +28,7 @@ def plan_of_words(words: Sequence[str]) -> int:
         config = job.config
         graph = build_graph(config, job.choices)
         plan = make_plan(graph.targets, Store(config.paths.store), remote_store(config))
-        print(f"{single_table(graph, plan)}\n\n{describe(plan)}")
+        print("\n".join([single_table(graph, plan), "", *map(str, graph.unread), describe(plan)]))
         return 0
     problems = [(job.title, job.problem) for job in jobs if job.config is None]
     ready = [ready_job(job) for job in jobs if job.config is not None]
@@ -40,6 +40,8 @@ def plan_of_words(words: Sequence[str]) -> int:
         before = sum(len(titles) for titles in merged.needed_by.values())
         count = len(ready) - len(merged.problems)
         print(f"{merged_table(merged, plan)}\n\n{count} jobs, {before} steps before merging; {describe(plan)}")
+    for decision, titles in merged.unread.items():
+        print(f"{decision} ({_some(titles)})")
     for title, problem in problems:
         print(f"{title}: {problem}")
     return 1 if problems else 0

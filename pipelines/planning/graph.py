@@ -28,6 +28,7 @@ from rtgs.config.schema import Choices, RunConfig
 from rtgs.core.decisions import Decision
 from rtgs.methods import find_method
 from rtgs.methods.settings import MethodSettings
+from rtgs.pretrained.keys import ABSENT
 from rtgs.train.settings import ScheduleSettings
 from rtgs.workflow import Step, StepKind
 from rtgs.workflow.fingerprint import flatten
@@ -46,7 +47,6 @@ KINDS: tuple[StepKind, ...] = (
 )
 """Every kind of step there is; the guard against forgotten version bumps goes through them."""
 
-ABSENT = "absent"  # in the place of a network's digest
 _NOT_SHOWN = ("paths.", "tracking.", "table.", "name", "threads", "scene.path", "method.paper_schedule.")
 
 
@@ -61,6 +61,7 @@ class RunGraph:
     report: Step
     mesh: Step | None = None
     skipped: tuple[Decision, ...] = ()  # ``what`` is the name of the step
+    unread: tuple[Decision, ...] = ()  # what the settings ask for and no step does
 
     @property
     def targets(self) -> tuple[Step, ...]:
@@ -98,9 +99,10 @@ def build_graph(config: RunConfig, choices: Choices, inspections: Inspections | 
     if mesh is None and config.mesh.extract:
         mesh = extract_mesh.STEP.step(_mesh_params(config), scene, *training)
     made = (rendered, measured) if mesh is None else (mesh, rendered, measured)
-    params = _report_params(config, choices, skipped)
+    unread = find_method(config.method.name).unread_losses(config.method)
+    params = _report_params(config, choices, skipped, unread)
     page = report.STEP.step(params, *prepared.steps, scene, *training, *made)
-    return RunGraph(scene, training, rendered, measured, page, mesh, skipped)
+    return RunGraph(scene, training, rendered, measured, page, mesh, skipped, unread)
 
 
 def _as_asked(config: RunConfig) -> RunConfig:
@@ -168,12 +170,15 @@ def method_label(choices: Choices) -> str:
     return choices.method if choices.ablation in ("", "none") else f"{choices.method}, {choices.ablation}"
 
 
-def _report_params(config: RunConfig, choices: Choices, skipped: tuple[Decision, ...]) -> report.ReportParams:
+def _report_params(
+    config: RunConfig, choices: Choices, skipped: tuple[Decision, ...], unread: tuple[Decision, ...]
+) -> report.ReportParams:
     values, defaults = shown_values(config), shown_values(RunConfig())
     lines = {key: (str(values[key]), str(defaults.get(key, ""))) for key in sorted(values)}
     title = f"{config.scene.name}: {method_label(choices)}, {choices.preset}"
-    decisions = tuple((f"no {step.what} step", step.why) for step in skipped)
-    return report.ReportParams(title, command(choices), lines, decisions)
+    decisions = [(f"no {step.what} step", step.why) for step in skipped]
+    decisions += [(each.what, each.why) for each in unread]
+    return report.ReportParams(title, command(choices), lines, tuple(decisions))
 
 
 def shown_values(config: RunConfig) -> dict[str, object]:

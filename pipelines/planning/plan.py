@@ -35,6 +35,7 @@ class MergedJobs:
     targets: tuple[Step, ...]
     needed_by: Mapping[str, tuple[str, ...]]  # titles of jobs by fingerprint
     skipped: Mapping[Decision, tuple[str, ...]]  # titles of jobs
+    unread: Mapping[Decision, tuple[str, ...]]  # titles of jobs
     problems: tuple[tuple[str, str], ...]  # title, message
 
 
@@ -43,6 +44,7 @@ def merge_jobs(jobs: Sequence[Job]) -> MergedJobs:
     targets: list[Step] = []
     needed_by: dict[str, tuple[str, ...]] = {}
     skipped: dict[Decision, tuple[str, ...]] = {}
+    unread: dict[Decision, tuple[str, ...]] = {}
     problems: list[tuple[str, str]] = []
     inspections = Inspections()
     for job in jobs:
@@ -56,7 +58,9 @@ def merge_jobs(jobs: Sequence[Job]) -> MergedJobs:
             needed_by[step.fingerprint] = (*needed_by.get(step.fingerprint, ()), job.title)
         for step in graph.skipped:
             skipped[step] = (*skipped.get(step, ()), job.title)
-    return MergedJobs(tuple(targets), needed_by, skipped, tuple(problems))
+        for decision in graph.unread:
+            unread[decision] = (*unread.get(decision, ()), job.title)
+    return MergedJobs(tuple(targets), needed_by, skipped, unread, tuple(problems))
 
 
 def describe(plan: Plan) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 
 from pipelines.steps.render import RenderTimes, read_timed
 from pipelines.steps.training import last_training, read_summary
+from rtgs.evaluate.networks import check_networks
 from rtgs.evaluate.settings import EvaluationSettings
 from rtgs.mesh.record import MeshRecord
 from rtgs.workflow import StepContext, StepKind
@@ -40,7 +41,13 @@ class EvaluateParams:
 
 
 def evaluate(params: EvaluateParams, context: StepContext) -> None:
-    """Write ``metrics.json``, ``metrics.csv`` and ``errors/<stem>.png``; without test views, tables without rows."""
+    """Write ``metrics.json``, ``metrics.csv`` and ``errors/<stem>.png``; without test views, tables without rows.
+
+    Raises:
+        MissingWeights: the recipe names a network of LPIPS that is not on this machine.
+        WrongWeights: the networks here are others than those that the recipe names.
+    """
+    check_networks(params.evaluation, context.tools)
     from rtgs.evaluate.evaluate import NO_TEST_VIEWS, evaluate_views, write_error_maps
     from rtgs.evaluate.records import GLASS_METRICS, RunFacts, write_csv, write_json
     from rtgs.scenes.canonical import read_scene

@@ -140,12 +140,13 @@ def _base_surface(method: Model, camera: Camera, step: int) -> Tensor:
 
     from rtgs.methods import Mode, RenderOptions
     from rtgs.methods.parts.part import Frame
+    from rtgs.train.losses import surface_depth
 
     wanted = RenderOptions(depth=True)
     with torch.no_grad():
         found = method.base.rasterize(Frame(camera, step, Mode.EVALUATE, wanted), wanted).buffers
     assert found.depth is not None
-    return _covered(found.depth / found.alpha.clamp_min(1e-6), found.alpha)
+    return _covered(surface_depth(found.depth, found.alpha), found.alpha)
 
 
 def _first_surface(view: View, maps: dict[str, Tensor]) -> Tensor:

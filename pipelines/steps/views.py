@@ -15,9 +15,11 @@ COVERAGE = "coverage.safetensors"
 
 def view_maps(rendered: RenderedView) -> dict[str, Tensor]:
     """Depth, normal, alpha and the layers of a view rendered with ``depth``, as the step ``render`` stores them."""
+    from rtgs.train.losses import surface_depth
+
     buffers = rendered.buffers
     assert buffers.depth is not None
-    depth = buffers.depth / buffers.alpha.clamp_min(1e-6)  # the buffer holds the sum of w z
+    depth = surface_depth(buffers.depth, buffers.alpha)
     maps = {"depth": depth, "normal": buffers.normal, "alpha": buffers.alpha}
     if rendered.layers is not None:
         maps |= {name: tensor.float() for name, tensor in rendered.layers.items()}

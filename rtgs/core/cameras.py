@@ -22,6 +22,15 @@ class Rays:
 
 
 @dataclass(frozen=True)
+class Pixels:
+    """The pixels of one camera that points fall into."""
+
+    index: Tensor  # (...,) int64 row * width + column; 0 where not framed
+    depth: Tensor  # (...,) z-depth
+    framed: Tensor  # (...,) bool: before the camera and inside the picture
+
+
+@dataclass(frozen=True)
 class Camera:
     """A pinhole camera without distortion (importers undistort).
 
@@ -86,11 +95,22 @@ class Camera:
 
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """World points (..., 3) to pixel coordinates (..., 2) and z-depth (...,)."""
-        local = self.to_camera(points)
+        x, y, depth = self._image(self.to_camera(points))
+        return torch.stack((x, y), dim=-1), depth
+
+    def pixels(self, local: Tensor) -> Pixels:
+        """The pixels of points (..., 3) in the camera frame (:meth:`to_camera`); of directions too, at infinity."""
+        x, y, depth = self._image(local)
+        column, row = x.floor(), y.floor()
+        framed = (depth > 0) & (column >= 0) & (row >= 0) & (column < self.width) & (row < self.height)
+        return Pixels(torch.where(framed, row * self.width + column, 0.0).long(), depth, framed)
+
+    def _image(self, local: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Pixel coordinates x and y, and z-depth."""
         depth = local[..., 2]
         x = self.fx * local[..., 0] / depth + self.cx
         y = self.fy * local[..., 1] / depth + self.cy
-        return torch.stack((x, y), dim=-1), depth
+        return x, y, depth
 
     def camera_rays(self, dtype: torch.dtype = torch.float32) -> Tensor:
         """(H, W, 3) rays through the pixel centres in the camera frame, z component 1."""

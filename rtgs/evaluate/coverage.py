@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -22,40 +23,48 @@ def judged(camera: Camera) -> Camera:
     return camera.resized(max(round(scale * camera.width), 1), max(round(scale * camera.height), 1))
 
 
-def framed(camera: Camera, depth: Tensor, other: Camera, seen: Tensor) -> Tensor:
-    """(H, W) bool: another picture shows what a pixel of this camera shows, with nothing before it.
+@dataclass(frozen=True)
+class Shown:
+    """What the pixels of a picture show."""
+
+    places: Tensor  # (H, W, 3) float64 in the world; where nothing is shown, the direction: infinitely far away
+    something: Tensor  # (H, W) bool
+
+    @staticmethod
+    def of(camera: Camera, depth: Tensor) -> Shown:
+        """Of a camera's picture, with the (H, W) z-depth of what its pixels show; 0: nothing."""
+        rays = camera.rays(torch.float64)
+        z = depth.double()[..., None]
+        return Shown(torch.where(z > 0, rays.origin + z * rays.directions, rays.directions), depth > 0)
+
+
+def framed(shown: Shown, other: Camera, seen: Tensor) -> Tensor:
+    """(H, W) bool: another picture shows what a pixel shows, with nothing before it.
 
     Parameters
     ----------
-    camera : Camera
-        Of the picture.
-    depth : Tensor
-        (H, W) z-depth of what its pixels show; 0: nothing, which is infinitely far away.
+    shown : Shown
+        By the pixels of the picture.
     other : Camera
         Of the other picture.
     seen : Tensor
         (H, W) z-depth of what that shows, 0 for nothing.
     """
-    rays = camera.rays(torch.float64)
-    z = depth.double()[..., None]
-    local = torch.where(z > 0, other.to_camera(rays.origin + z * rays.directions), rays.directions @ other.rotation.T)
-    there = local[..., 2]
-    column = (other.fx * local[..., 0] / there + other.cx).floor()
-    row = (other.fy * local[..., 1] / there + other.cy).floor()
-    inside = (there > 0) & (column >= 0) & (row >= 0) & (column < other.width) & (row < other.height)
-    index = torch.where(inside, row * other.width + column, 0.0).long()
-    before = seen.double().reshape(-1)[index]
-    free = torch.where(depth > 0, before > (1 - OCCLUDED) * there, torch.zeros_like(inside))
-    return inside & (free | (before <= 0))
+    there = shown.places @ other.rotation.T
+    at = other.pixels(torch.where(shown.something[..., None], there + other.translation, there))
+    before = seen.double().reshape(-1)[at.index]
+    free = shown.something & (before > (1 - OCCLUDED) * at.depth)
+    return at.framed & (free | (before <= 0))
 
 
 def framed_by(pictures: Sequence[tuple[Camera, Tensor]], others: Iterable[tuple[Camera, Tensor]]) -> list[Tensor]:
     """Of each picture, a camera and the (H, W) z-depth of what it shows: (H, W) int16, how many of the others show the
     same (:func:`framed`). The others are asked for one by one, and none is kept."""
+    shown = [Shown.of(camera, depth) for camera, depth in pictures]
     counts = [torch.zeros(depth.shape, dtype=torch.int16) for _, depth in pictures]
     for other, seen in others:
-        for count, (camera, depth) in zip(counts, pictures, strict=True):
-            count += framed(camera, depth, other, seen)
+        for count, picture in zip(counts, shown, strict=True):
+            count += framed(picture, other, seen)
     return counts
 
 

@@ -227,15 +227,11 @@ def _evidence(values: np.ndarray, grid: Grid, views: Sequence[MaskView], setting
 def _in_front(view: MaskView, points: Tensor, margin: float) -> np.ndarray:
     """(N,) bool: the view shows something transparent at the point's pixel, and the point lies in front of the base
     set's surface there, or there is none."""
-    camera = view.camera
-    pixels, depth = camera.project(points)
-    column, row = pixels[:, 0].floor(), pixels[:, 1].floor()
-    framed = (depth > 0) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
-    index = torch.where(framed, row * camera.width + column, 0.0).long()
+    at = view.camera.pixels(view.camera.to_camera(points))
     assert view.depth is not None
-    surface = view.depth.reshape(-1)[index].double()
-    free = (surface <= 0) | (depth < surface + margin)
-    return (framed & view.mask.reshape(-1)[index] & free).numpy()
+    surface = view.depth.reshape(-1)[at.index].double()
+    free = (surface <= 0) | (at.depth < surface + margin)
+    return (at.framed & view.mask.reshape(-1)[at.index] & free).numpy()
 
 
 def _convex_distance(points: np.ndarray, centres: np.ndarray, voxel: float) -> np.ndarray:

@@ -39,7 +39,8 @@ class SurfaceFit:
 
     Attributes:
         iou_before, iou: silhouette IoU of the hull and of the surface with the masks, where nothing hides the object.
-        outline_before, outline: pixels between their outlines and those of the masks, root mean square.
+        outline_before, outline: pixels between their outlines and those of the masks, root mean square; None:
+            the surface has no rim near an outline.
         contradicted: share of the surface's seen area where the outlines are off by more than their noise.
         strength: of smoothing: voxels, median over the vertices.
         sharp: of a free surface: share of the vertices at which the outlines asked for less smoothing: edges.
@@ -50,8 +51,8 @@ class SurfaceFit:
 
     iou_before: float
     iou: float
-    outline_before: float
-    outline: float
+    outline_before: float | None
+    outline: float | None
     contradicted: float
     strength: float | None = None
     sharp: float | None = None

@@ -70,9 +70,9 @@ class Rims:
         return self.offset / self.pixel
 
     @property
-    def spread(self) -> float:
-        """Pixels: root mean square of the offsets; 0 without samples."""
-        return float(np.sqrt(np.mean(self.pixels**2))) if len(self) else 0.0
+    def spread(self) -> float | None:
+        """Pixels: root mean square of the offsets; None: no samples."""
+        return float(np.sqrt(np.mean(self.pixels**2))) if len(self) else None
 
     def matrix(self, count: int) -> Any:
         """(R, count) sparse: from values at the vertices to values at the samples."""

@@ -7,7 +7,7 @@ they do not contradict.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from rtgs.core.decisions import Decision
 from rtgs.mesh.ball import fit_ball
@@ -32,7 +32,7 @@ class Surface:
 
     mesh: TriangleMesh
     kind: str  # "sphere", "revolution", "planes", "free", or empty: the hull stays
-    fit: SurfaceFit
+    fit: SurfaceFit  # where the hull stays: of the last surface that was refused
     decision: Decision
 
 
@@ -41,11 +41,12 @@ class _Candidate:
     mesh: TriangleMesh
     kind: str
     said: str  # what it is
-    fit: SurfaceFit  # what is known before it is judged
     contradicted: float | None = None  # share where the outlines are off; None: by its rims
-
-
-_NOTHING = SurfaceFit(0.0, 0.0, 0.0, 0.0, 0.0)
+    strength: float | None = None  # these as in SurfaceFit
+    sharp: float | None = None
+    unseen: float | None = None
+    feet: int | None = None
+    held: int | None = None
 
 
 def find_surface(hull: HullResult, masks: MaskSet, settings: SurfaceSettings, score: Score) -> Surface:
@@ -54,7 +55,7 @@ def find_surface(hull: HullResult, masks: MaskSet, settings: SurfaceSettings, sc
     views = rim_views(masks.views, hull.hidden)
     before = find_rims(MeshShape.of(hull.mesh), views).spread
     carved = score(hull.mesh).mean
-    refused = []
+    fit, refused = None, []
     for found in _candidates(hull, views, settings):
         shape = MeshShape.of(found.mesh)
         rims = find_rims(shape, views)
@@ -63,9 +64,8 @@ def find_surface(hull: HullResult, masks: MaskSet, settings: SurfaceSettings, sc
             share = contradicted_share(shape, rims, hull.voxel, settings.tolerance)
         cost = settings.iou_cost if found.kind != "planes" else 0.0  # edges alone tell too little of what lies between
         iou = score(found.mesh).mean
-        fit = replace(
-            found.fit, iou_before=carved, iou=iou, outline_before=before, outline=rims.spread, contradicted=share
-        )
+        known = (found.strength, found.sharp, found.unseen, found.feet, found.held)
+        fit = SurfaceFit(carved, iou, before, rims.spread, share, *known)
         if found.kind != "free" and share > settings.contradicted:
             why = f"outlines contradict it on {100 * share:.0f} % of its area"
             refused.append(f"{found.said}: {why} (mesh.object.surface.contradicted {settings.contradicted:g})")
@@ -75,7 +75,8 @@ def find_surface(hull: HullResult, masks: MaskSet, settings: SurfaceSettings, sc
         else:
             why = "; ".join([f"{found.said}; {_figures(fit)}", *(f"not {text}" for text in refused)])
             return Surface(found.mesh, found.kind, fit, Decision(f"hull smoothed: {found.kind}", why))
-    return Surface(hull.mesh, "", _NOTHING, Decision("hull not smoothed", "; ".join(refused)))
+    assert fit is not None  # a free surface is always tried
+    return Surface(hull.mesh, "", fit, Decision("hull not smoothed", "; ".join(refused)))
 
 
 def _candidates(hull: HullResult, views: list[RimView], settings: SurfaceSettings) -> Iterator[_Candidate]:
@@ -83,27 +84,28 @@ def _candidates(hull: HullResult, views: list[RimView], settings: SurfaceSetting
     if settings.fit == "auto":
         ball = fit_ball(hull.mesh, views)
         if ball is not None:
-            yield _Candidate(ball.mesh(), "sphere", f"a sphere of radius {ball.radius:.4g}", _NOTHING)
+            yield _Candidate(ball.mesh(), "sphere", f"a sphere of radius {ball.radius:.4g}")
         turned = fit_revolution(hull.mesh, hull.voxel, views, settings.foot_degrees)
         if turned is not None:
             said = f"a surface of revolution, its profile smoothed over {turned.length:g} voxels"
-            fit = replace(_NOTHING, strength=turned.length, unseen=1 - float(turned.seen.mean()))
-            yield _Candidate(turned.mesh(), "revolution", said, fit)
+            unseen = 1 - float(turned.seen.mean())
+            yield _Candidate(turned.mesh(), "revolution", said, strength=turned.length, unseen=unseen)
         flat = fit_planes(hull.mesh, hull.voxel, views, settings.tolerance)
         if flat is not None:
             said = f"a body of {len(flat.body.normals)} planes"
-            yield _Candidate(flat.body.mesh(hull.voxel), "planes", said, _NOTHING, flat.contradicted)
+            yield _Candidate(flat.body.mesh(hull.voxel), "planes", said, flat.contradicted)
     free = fair_surface(hull.mesh, hull.voxel, views, settings)
     said = f"smoothed over {free.strength:.1f} voxels, less at {100 * free.sharp:.0f} % of the vertices, where the "
     said += f"outlines contradict; no outline tells of {100 * free.unseen:.1f} %"
     parts = [(free.feet, "made plane"), (free.held, "held where the hull is")]
     said += "".join(f", {count} part{'s' if count > 1 else ''} {what}" for count, what in parts if count)
-    fit = replace(
-        _NOTHING, strength=free.strength, sharp=free.sharp, unseen=free.unseen, feet=free.feet, held=free.held
-    )
-    yield _Candidate(free.mesh, "free", said, fit)
+    known = (free.strength, free.sharp, free.unseen, free.feet, free.held)
+    yield _Candidate(free.mesh, "free", said, None, *known)
 
 
 def _figures(fit: SurfaceFit) -> str:
     iou = f"silhouette IoU {fit.iou:.4f}, {fit.iou_before:.4f} as carved"
-    return f"{iou}; outlines {fit.outline:.2f} px off, {fit.outline_before:.2f} as carved"
+    if fit.outline is None:
+        return f"{iou}; no rim of it is near an outline"
+    before = "" if fit.outline_before is None else f", {fit.outline_before:.2f} as carved"
+    return f"{iou}; outlines {fit.outline:.2f} px off{before}"

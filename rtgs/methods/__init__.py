@@ -73,9 +73,10 @@ def create_method(
         raise ValueError(f"method {spec.name} has no stage that takes an object mesh, or it is switched off")
     pixels = max((view.camera.width * view.camera.height for view in scene.train), default=0)
     settings, lowered = bound_by_pixels(settings, pixels)
+    decisions = (*lowered, *spec.unread_losses(settings))
     stages = spec.timeline(settings, schedule, transparent=object_mesh is not None)
     made = spec.build(
-        Setup(spec, settings, scene, schedule, generator, object_mesh, stages, lowered, spec.own_settings(settings))
+        Setup(spec, settings, scene, schedule, generator, object_mesh, stages, decisions, spec.own_settings(settings))
     )
     if not isinstance(made, Model):
         raise TypeError(f"method {spec.name} was built as a {type(made).__name__}, not as a rtgs.methods.model.Model")

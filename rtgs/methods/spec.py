@@ -7,13 +7,14 @@ file in ``conf/method`` (docs/new_method.md shows one from the first line to the
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from rtgs.core.build import build_checked
 from rtgs.core.decisions import Decision
 from rtgs.core.errors import RtgsError
 from rtgs.train.method import Method, Stage
+from rtgs.train.settings import LOSS_WEIGHTS
 
 if TYPE_CHECKING:
     import torch
@@ -83,7 +84,7 @@ class Setup:
         generator: drawn from at initialisation, in training views and by density control; it travels in checkpoints.
         object_mesh: of the scene's transparent object, for methods with a stage that needs it; None: without it.
         stages: of this run.
-        decisions: what was lowered in the settings.
+        decisions: what was lowered in the settings, or has no effect.
     """
 
     spec: MethodSpec
@@ -157,6 +158,32 @@ class MethodSpec:
     def object_stage(self, settings: MethodSettings) -> StageSpec | None:
         """The stage that needs a transparent object's mesh, where the settings ask for it."""
         return next((stage for stage in self.stages if stage.needs_object and stage.on(settings)), None)
+
+    def unread_losses(self, settings: MethodSettings) -> tuple[Decision, ...]:
+        """The weights of losses that are above 0 and that no stage reads.
+
+        In the place of what it does not read a stage has the dataclass's default, so a weight of that value is not
+        among them.
+        """
+        weights = {name: getattr(settings.loss, name) for name in LOSS_WEIGHTS}
+        return tuple(
+            Decision(f"method.loss.{name}={weight:g} has no effect", self._why_unread(name, settings))
+            for name, weight in weights.items()
+            if weight > 0 and not self._reads_loss(name, settings)
+        )
+
+    def _why_unread(self, loss: str, settings: MethodSettings) -> str:
+        key = f"{loss}_start"
+        if hasattr(settings.loss, key):
+            at_once = replace(settings, loss=replace(settings.loss, **{key: 0.0}))
+            if self._reads_loss(loss, at_once):
+                start = getattr(settings.loss, key)
+                return f"no stage of {self.name} reads it where method.loss.{key} is {start:g}, let it start earlier"
+        return f"{self.name} has no such loss"
+
+    def _reads_loss(self, loss: str, settings: MethodSettings) -> bool:
+        weight = getattr(settings.loss, loss)
+        return any(getattr(stage.reads(settings).loss, loss) == weight for stage in self.stages)
 
     def before(self, name: str, settings: MethodSettings, schedule: ScheduleSettings) -> Stage:
         """The stage that goes on to the end of a run where the stage ``name`` turns out to have no object."""

@@ -5,18 +5,10 @@ Without torch: a plan is made of these.
 
 from __future__ import annotations
 
-import platform
 from collections.abc import Iterable
 
-from rtgs.pretrained.weights import (
-    LPIPS_VGG,
-    VGG16,
-    MissingWeights,
-    PretrainedFile,
-    WrongWeights,
-    find_weights,
-    verify_weights,
-)
+from rtgs.pretrained.keys import Use, check_named, check_unnamed
+from rtgs.pretrained.weights import LPIPS_VGG, VGG16, PretrainedFile
 from rtgs.train.settings import LossSettings
 
 Named = tuple[tuple[str, str], ...]  # (name, SHA-256) of pretrained files
@@ -52,32 +44,9 @@ def check_networks(loss: LossSettings, key: Iterable[tuple[str, str]]) -> None:
     """
     files, named = networks_of(loss), dict(key)
     what = f"the perceptual loss (method.loss.perceptual={loss.perceptual:g}, perceptual_form={loss.perceptual_form})"
-    here = f"this machine ({platform.node()})"
+    use = Use(what, "train", "trained", "method.loss.perceptual=0")
     for file in files:
-        if file.name not in named:
-            continue
-        try:
-            verify_weights(file, find_weights(file))
-        except (MissingWeights, WrongWeights) as error:
-            why = str(error).rstrip(".")
-            raise type(error)(
-                f"the key of this step names the network {file.name} (SHA-256 {named[file.name][:16]}...) of {what}, "
-                f"and {here} cannot train with it: {why}. Or copy it from the machine that made the plan"
-            ) from error
-    if files and not any(file.name in named for file in files) and _all_here(files):
-        names = ", ".join(file.filename for file in files)
-        raise WrongWeights(
-            f"the key of this step names no network of {what}, because the machine that made the plan lacks one, but "
-            f"{here} has {names}: what it trains would be stored as trained without. Put the files on the machine that "
-            "makes the plan, or set method.loss.perceptual=0; where both are one machine, the file has just arrived: "
-            "repeat the command"
-        )
-
-
-def _all_here(files: Iterable[PretrainedFile]) -> bool:
-    try:
-        for file in files:
-            find_weights(file)
-    except MissingWeights:
-        return False
-    return True
+        if file.name in named:
+            check_named(file, named[file.name], use)
+    if not any(file.name in named for file in files):
+        check_unnamed(files, use)

@@ -14,6 +14,8 @@ from rtgs.core.refuse import refuse_bad_numbers, refuse_unknown_words, refuse_un
 MonoNormalForm = Literal["cosine", "envgs"]
 PerceptualForm = Literal["lpips", "vgg_l1"]
 TransmissionDepthForm = Literal["accum", "mean", "per_hit"]
+LOSS_WEIGHTS = ("l1", "dssim", "normal", "mono_normal", "distortion", "perceptual", "specular", "transmission_depth")
+"""The fields of :class:`LossSettings` that are weights of terms."""
 
 
 @dataclass(frozen=True)

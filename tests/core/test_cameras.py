@@ -43,6 +43,23 @@ def test_projecting_a_point_of_a_pixel_ray_gives_the_pixel_and_its_depth():
     assert view.rays().directions.dtype == torch.float32
 
 
+def test_points_fall_into_the_pixels_that_they_project_to_or_into_none():
+    view = camera()
+    spread = torch.rand(500, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    points = view.center + ((spread - 0.5) * torch.tensor([2.0, 2.0, 6.0])) @ view.rotation
+    found = view.pixels(view.to_camera(points))
+    pixel, depth = view.project(points)
+    assert torch.equal(found.depth, depth)
+    inside = (depth > 0) & (pixel >= 0).all(1) & (pixel < torch.tensor([20, 15])).all(1)
+    assert torch.equal(found.framed, inside)
+    assert 10 < int(inside.sum()) < 490
+    column, row = pixel[inside].long().T
+    assert torch.equal(found.index[inside], 20 * row + column)
+    assert not found.index[~inside].any()
+    every = view.pixels(view.camera_rays(torch.float64))
+    assert torch.equal(every.index, torch.arange(300).reshape(15, 20)), "directions too"
+
+
 def test_resizing_scales_pixel_edges():
     view = camera()
     small = view.resized(10, 5)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from rtgs.core.cameras import Camera
-from rtgs.evaluate.coverage import LONG_SIDE, at_size, framed, framed_by, judged
+from rtgs.evaluate.coverage import LONG_SIDE, Shown, at_size, framed, framed_by, judged
 
 WIDTH, HEIGHT, FOCAL, AWAY = 40, 30, 40.0, 2.0
 
@@ -28,7 +28,7 @@ def test_a_camera_to_the_side_shows_the_columns_that_are_left(columns: int):
     aside = camera(columns * AWAY / FOCAL)
     expected = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
     expected[:, columns:] = True
-    assert torch.equal(framed(camera(0.0), flat(AWAY), aside, flat(AWAY)), expected)
+    assert torch.equal(framed(Shown.of(camera(0.0), flat(AWAY)), aside, flat(AWAY)), expected)
 
 
 def test_views_are_counted_and_those_that_look_away_are_not():
@@ -39,11 +39,19 @@ def test_views_are_counted_and_those_that_look_away_are_not():
     assert bool((twice[1] == 1).all())
 
 
+def test_a_picture_s_points_are_made_once(monkeypatch: pytest.MonkeyPatch):
+    asked = []
+    rays = Camera.rays
+    monkeypatch.setattr(Camera, "rays", lambda *given: asked.append(1) or rays(*given))
+    framed_by([(camera(0.0), flat(AWAY))] * 2, [(camera(0.0), flat(AWAY))] * 5)
+    assert len(asked) == 2
+
+
 def test_what_is_hidden_from_a_camera_is_not_shown_by_it():
     """A thing at half the depth covers the right half of the other picture; what is 2 % nearer hides nothing."""
     hiding = flat(0.98 * AWAY)
     hiding[:, WIDTH // 2 :] = AWAY / 2
-    shown = framed(camera(0.0), flat(AWAY), camera(0.0), hiding)
+    shown = framed(Shown.of(camera(0.0), flat(AWAY)), camera(0.0), hiding)
     assert bool(shown[:, : WIDTH // 2].all())
     assert not shown[:, WIDTH // 2 :].any()
 
@@ -52,11 +60,12 @@ def test_what_is_hidden_from_a_camera_is_not_shown_by_it():
 def test_the_sky_is_shown_where_the_other_picture_looks_the_same_way_and_has_nothing_before_it(away: float):
     sky, other = flat(0.0), flat(0.0)
     other[: HEIGHT // 2] = 5.0
-    shown = framed(camera(0.0), sky, camera(away), other)
+    shown = framed(Shown.of(camera(0.0), sky), camera(away), other)
     assert bool(shown[HEIGHT // 2 :].all()), "so far away that a step to the side is nothing"
     assert not shown[: HEIGHT // 2].any()
-    assert not framed(camera(0.0), sky, camera(away, turned=True), sky).any()
-    assert bool(framed(camera(0.0), flat(AWAY), camera(0.0), sky).all()), "a picture without a depth hides nothing"
+    assert not framed(Shown.of(camera(0.0), sky), camera(away, turned=True), sky).any()
+    plane = Shown.of(camera(0.0), flat(AWAY))
+    assert bool(framed(plane, camera(0.0), sky).all()), "a picture without a depth hides nothing"
 
 
 def test_large_pictures_are_judged_at_fewer_pixels():

@@ -10,7 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from rtgs.core.errors import RtgsError
-from rtgs.mesh import fairing
+from rtgs.mesh import choose, fairing
 from rtgs.mesh.ball import fit_ball
 from rtgs.mesh.choose import choose_object_mesh
 from rtgs.mesh.container import ObjectMesh, read_object_mesh, write_object_mesh
@@ -52,7 +52,9 @@ def normals_of(mesh: TriangleMesh, surface: str, voxel: float, truth: TriangleMe
 def outline(mesh: TriangleMesh, masks: MaskSet) -> float:
     """Pixels between the outlines of mesh and masks."""
     nothing = [torch.zeros_like(view.mask) for view in masks.views]
-    return find_rims(MeshShape.of(mesh), rim_views(masks.views, nothing)).spread
+    found = find_rims(MeshShape.of(mesh), rim_views(masks.views, nothing)).spread
+    assert found is not None
+    return found
 
 
 @pytest.mark.parametrize("name", list(BODIES))
@@ -242,6 +244,20 @@ def test_a_mesh_that_masks_contradict_stays() -> None:
     assert found.kind == ""
     assert found.decision.what == "hull not smoothed"
     assert "it may cost 0.003, mesh.object.surface.iou_cost" in found.decision.why
+    refused = fair_surface(hull.mesh, hull.voxel, rim_views(masks.views, hull.hidden), FREE)
+    said = found.fit
+    assert (said.iou_before, said.iou) == (worse(hull.mesh).mean, worse(refused.mesh).mean)
+    assert (said.outline_before, said.outline) == (outline(hull.mesh, masks), outline(refused.mesh, masks))
+    assert (said.strength, said.sharp, said.unseen) == (refused.strength, refused.sharp, refused.unseen)
+
+
+def test_where_no_outline_is_known_none_is_told_of() -> None:
+    hull, masks = carved(BODIES["sphere"], 24)
+    hidden = replace(hull, hidden=tuple(torch.ones_like(view.mask) for view in masks.views))
+    found = found_of(hidden, masks)
+    assert found.kind == "free"
+    assert (found.fit.outline_before, found.fit.outline, found.fit.contradicted) == (None, None, 1)
+    assert "no rim of it is near an outline" in found.decision.why
 
 
 def test_the_choice_tells_and_the_files_keep_it(tmp_path) -> None:
@@ -259,6 +275,19 @@ def test_the_choice_tells_and_the_files_keep_it(tmp_path) -> None:
     carved = ObjectSettings(hull=HullSettings(voxels=32), surface=SurfaceSettings(fit="carved"))
     plain = choose_object_mesh("auto", masks, carved, no_fusion)
     assert (plain.mesh.surface, plain.fit) == ("", None)
+
+
+def test_a_hull_that_stays_has_no_figures_of_a_surface_in_its_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(hull: HullResult, masks: MaskSet, settings: SurfaceSettings, score: object) -> Surface:
+        found = find_surface(hull, masks, settings, lambda mesh: silhouette_score(mesh, masks.views))
+        return replace(found, mesh=hull.mesh, kind="")
+
+    monkeypatch.setattr(choose, "find_surface", refused)
+    masks = masks_of(BODIES["sphere"], ring(24))
+    stays = choose_object_mesh("auto", masks, ObjectSettings(hull=HullSettings(voxels=32), surface=FREE), no_fusion)
+    assert stays.fit is None
+    assert "surface" not in stays.candidates
+    assert stays.candidates["hull"] == stays.iou.mean > 0.9
 
 
 @pytest.mark.parametrize(

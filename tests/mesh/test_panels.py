@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -17,7 +19,7 @@ AXIS = Axis.along(np.array([0.2, -0.1, 0.5]), np.array([0.1, 0.2, 1.0]))
 def turned(*corners: tuple[float, float]) -> TriangleMesh:
     """A profile through these corners (radius, height), a vertex every half voxel."""
     nodes = [np.array(corners[:1])]
-    for start, end in zip(corners[:-1], corners[1:], strict=True):
+    for start, end in itertools.pairwise(corners):
         a, b = np.array(start), np.array(end)
         count = max(round(float(np.linalg.norm(b - a)) / (0.5 * VOXEL)), 1)
         nodes.append(a + (b - a) * (np.arange(count) + 1)[:, None] / count)

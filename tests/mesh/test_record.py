@@ -32,8 +32,12 @@ OBJECT = MeshRecord(
     faces=12,
 )
 
+UNSEEN = replace(OBJECT, truth=None, surface_fit=SurfaceFit(0.99, 0.995, None, None, 1.0))
 
-@pytest.mark.parametrize("record", [SCENE, replace(OBJECT, truth=None), MeshRecord(absent="there are no masks")])
+
+@pytest.mark.parametrize(
+    "record", [SCENE, replace(OBJECT, truth=None), UNSEEN, MeshRecord(absent="there are no masks")]
+)
 def test_a_record_comes_back_and_what_is_not_known_is_not_written(record: MeshRecord, tmp_path: Path) -> None:
     record.write(tmp_path)
     assert MeshRecord.read(tmp_path) == record

@@ -8,6 +8,7 @@ import pytest
 import torch
 from training_cases import HEIGHT, WIDTH, small_method, small_scene, small_schedule
 
+from rtgs.core.decisions import Decision
 from rtgs.core.errors import RtgsError
 from rtgs.gaussians.channels import Channel
 from rtgs.gaussians.settings import DensitySettings
@@ -147,6 +148,13 @@ def test_a_zero_weight_is_never_computed_and_is_told(monkeypatch):
     assert [term.name for term in terms.terms] == ["l1", "dssim"]
     told = {decision.what for decision in method.decisions}
     assert told == {"no normal consistency loss", "no monocular normal loss", "no distortion loss"}
+
+
+def test_a_weight_that_no_term_reads_is_told():
+    settings = small_method()
+    method, _ = make(replace(settings, loss=replace(settings.loss, perceptual=0.02)))
+    assert Decision("method.loss.perceptual=0.02 has no effect", "2dgs has no such loss") in method.decisions
+    assert not any("no effect" in decision.what for decision in make(settings)[0].decisions)
 
 
 def test_every_loss_that_is_on_is_computed_and_weighted():

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import pytest
 
 from rtgs.methods import MethodSpec, StageSpec, find_method, is_own, method_names, own_methods
 from rtgs.methods.family import DIFFUSE, REFLECTION, TRANSMITTANCE
 from rtgs.methods.settings import MethodSettings, ReflectionSettings, TransmittanceSettings
-from rtgs.train.settings import ScheduleSettings
+from rtgs.train.settings import LOSS_WEIGHTS, LossSettings, ScheduleSettings
 
 PLAN = ScheduleSettings(total=100)
 
@@ -95,3 +95,36 @@ def test_where_there_is_no_object_the_stage_before_goes_on():
     last = StageSpec("polish", lambda settings, schedule: 80, "method.reflection.start")
     longer = MethodSpec("longer", (DIFFUSE, REFLECTION, TRANSMITTANCE, last), unbuilt)
     assert longer.before("transmittance", settings(0.3), PLAN).name == "reflection"
+
+
+def unread(method: str, **loss: float) -> list[str]:
+    found = find_method(method).unread_losses(MethodSettings(name=method, loss=LossSettings(**loss)))
+    return [str(decision) for decision in found]
+
+
+def test_a_weight_that_no_stage_reads_is_told():
+    assert unread("2dgs", perceptual=0.02) == ["method.loss.perceptual=0.02 has no effect: 2dgs has no such loss"]
+    everything = dict.fromkeys(LOSS_WEIGHTS, 0.03)
+    for method in ("2dgs", "3dgs"):
+        names = [text.split("=")[0].split(".")[-1] for text in unread(method, **everything)]
+        assert names == ["perceptual", "specular", "transmission_depth"]
+    depth = "method.loss.transmission_depth=0.03 has no effect: envgs has no such loss"
+    late = "method.loss.specular=0.03 has no effect: no stage of envgs reads it where method.loss.specular_start is 0.5"
+    assert unread("envgs", **everything, specular_start=0.5) == [f"{late}, let it start earlier", depth]
+    assert unread("envgs", **everything, specular_start=0.1) == [depth]
+    assert unread("rtgs", **everything) == []
+
+
+def test_a_weight_that_is_off_or_the_default_is_not_told():
+    assert [unread(spec.name) for spec in own_methods()] == [[]] * len(own_methods())
+    forgets = StageSpec("diffuse", reads=lambda settings: replace(settings, loss=LossSettings()))
+    spec = MethodSpec("forgetful", (forgets,), unbuilt)
+    asked = replace(MethodSettings(), loss=LossSettings(normal=LossSettings().normal, distortion=0.1, mono_normal=0.0))
+    (decision,) = spec.unread_losses(asked)
+    assert str(decision) == "method.loss.distortion=0.1 has no effect: forgetful has no such loss"
+
+
+def test_the_weights_of_losses_are_known():
+    shares = ("_start", "_gain", "_masked", "_target")
+    numbers = [each.name for each in fields(LossSettings) if each.type == "float" and not each.name.endswith(shares)]
+    assert tuple(numbers) == LOSS_WEIGHTS

@@ -69,19 +69,10 @@ def seen_bare(points: Tensor, views: Iterable[View], depths: Depths) -> Tensor:
     """(N,) int64: in how many views a point (N, 3) lies on the opaque surface of a pixel that is not masked."""
     counts = torch.zeros(len(points), dtype=torch.int64)
     for view, mask in masked_views(views):
-        index, depth, framed = _pixels(view.camera, points)
-        surface = depths(view.camera).reshape(-1)[index]
-        counts += framed & ~mask.reshape(-1)[index] & ((depth - surface).abs() < _ON_SURFACE * surface)
+        at = view.camera.pixels(view.camera.to_camera(points.double()))
+        surface, masked = (picture.reshape(-1)[at.index] for picture in (depths(view.camera), mask))
+        counts += at.framed & ~masked & ((at.depth.float() - surface).abs() < _ON_SURFACE * surface)
     return counts
-
-
-def _pixels(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Of points (N, 3): (N,) int64 pixel in the flattened picture, (N,) float32 z-depth, (N,) bool in the picture (the
-    pixel of the others is 0)."""
-    pixels, depth = camera.project(points.double())
-    column, row = pixels[:, 0].floor(), pixels[:, 1].floor()
-    framed = (depth > 0) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
-    return torch.where(framed, row * camera.width + column, 0.0).long(), depth.float(), framed
 
 
 def on_surface(guide: ObjectGuide, views: Iterable[View], weights: SurfaceWeights) -> float | None:
@@ -102,6 +93,6 @@ def on_surface(guide: ObjectGuide, views: Iterable[View], weights: SurfaceWeight
 def near_surface(points: Tensor, camera: Camera, depth: Tensor, reach: float) -> Tensor:
     """(N,) bool: points (N, 3) that lie within ``reach`` of the surface of the pixel they are in, (H, W) z-depth, 0
     where there is none."""
-    index, z, framed = _pixels(camera, points)
-    surface = depth.reshape(-1)[index]
-    return framed & (surface > 0) & ((z - surface).abs() < reach)
+    at = camera.pixels(camera.to_camera(points.double()))
+    surface = depth.reshape(-1)[at.index]
+    return at.framed & (surface > 0) & ((at.depth.float() - surface).abs() < reach)

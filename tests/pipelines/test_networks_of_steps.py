@@ -1,4 +1,4 @@
-"""Networks of the perceptual loss: what the key of a training names of them, and a worker that lacks them."""
+"""Networks of the perceptual loss and of LPIPS: what the key of a training names, and workers that lack them."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ import logging
 from pathlib import Path
 
 import pytest
-from app_cases import QUICK, _in_root, capture, root  # noqa: F401  (fixtures)
-from training_cases import small_schedule
 
 from pipelines.planning.graph import RunGraph, build_graph
 from pipelines.steps.train import train_step
@@ -20,6 +18,8 @@ from rtgs.pretrained.weights import LPIPS_VGG, VGG16
 from rtgs.train.settings import LossSettings
 from rtgs.workflow import InlineExecutor, Store, make_plan
 from rtgs.workflow.engine import WorkerJob, run_step
+from tests.pipelines.app_cases import QUICK, _in_root, capture, root  # noqa: F401  (fixtures)
+from tests.train.training_cases import small_schedule
 
 BOTH = (("lpips_vgg", LPIPS_VGG.sha256), ("vgg16", VGG16.sha256))
 WORDS = ("method=rtgs", *QUICK, "method.reflection.cells=3", "method.reflection.matte.probation=0")
@@ -85,3 +85,28 @@ def test_a_worker_without_the_networks_of_the_key_does_not_train(capture: Path, 
         assert part in outcome.problem
     assert store.find(second) is None
     assert not store.partial(second).exists(), "nothing was trained"
+
+
+def test_a_worker_with_other_networks_than_the_key_s_does_not_measure(
+    capture: Path,  # noqa: F811
+    here: Path,
+    tmp_path: Path,
+):
+    bare = graph_of(capture, "method=2dgs").evaluate
+    put(here, VGG16, LPIPS_VGG)
+    whole = graph_of(capture, "method=2dgs").evaluate
+    assert bare.fingerprint != whole.fingerprint
+    store = Store(tmp_path / "store")
+    InlineExecutor(store).execute(make_plan(whole.upstream, store))
+    job = WorkerJob(str(store.root), 1)
+    outcome = run_step(bare, job, [])
+    assert outcome.failed
+    assert "WrongWeights: the key of this step names no network of LPIPS (evaluation.lpips=true)" in outcome.problem
+    for file in (VGG16, LPIPS_VGG):
+        (here / file.filename).unlink()  # as on another machine
+    outcome = run_step(whole, job, [])
+    assert outcome.failed
+    for part in ("the key of this step names the network vgg16", f"searched {here}", "set evaluation.lpips=false"):
+        assert part in outcome.problem
+    assert [store.find(step) for step in (bare, whole)] == [None, None], "no table without its figures is stored"
+    assert not run_step(bare, job, []).failed
