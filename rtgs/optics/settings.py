@@ -61,7 +61,7 @@ class WallSettings:
     # Share of the third stage after which parts of the mesh between creases are judged from training views: walls or
     # openings, as that of a cup (docs/glass_light.md). 0: all are walls.
     openings: float = field(default=0.0, metadata=UNLESS_DEFAULT)
-    opening_gain: float = field(default=0.02, metadata=UNLESS_DEFAULT)  # fall of the squared error there, at least
+    opening_gain: float = field(default=0.005, metadata=UNLESS_DEFAULT)  # fall of the squared error there, at least
     cover: float = 0.9  # a composited k_s from which on a pixel is all glass: what L_spec asks of the interface
 
     def __post_init__(self) -> None:
