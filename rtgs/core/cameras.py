@@ -103,7 +103,8 @@ class Camera:
         x, y, depth = self._image(local)
         column, row = x.floor(), y.floor()
         framed = (depth > 0) & (column >= 0) & (row >= 0) & (column < self.width) & (row < self.height)
-        return Pixels(torch.where(framed, row * self.width + column, 0.0).long(), depth, framed)
+        row, column = (torch.where(framed, each, 0.0).long() for each in (row, column))
+        return Pixels(row * self.width + column, depth, framed)
 
     def _image(self, local: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Pixel coordinates x and y, and z-depth."""

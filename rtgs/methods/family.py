@@ -29,7 +29,7 @@ DIFFUSE = StageSpec("diffuse", reads=diffuse_alone, version=5)
 """One base set, rasterised: the whole of 2DGS and 3DGS, the beginning of the others."""
 
 REFLECTION = StageSpec(
-    "reflection", _reflection_start, "method.reflection.start", reads=without_transmittance, version=3
+    "reflection", _reflection_start, "method.reflection.start", reads=without_transmittance, version=4
 )
 """Base set with materials and a traced reflection set, jointly."""
 
@@ -41,6 +41,6 @@ TRANSMITTANCE = StageSpec(
     on=_transmittance_on,
     on_key="method.transmittance.enabled",
     needs_object=True,
-    version=6,
+    version=7,
 )
 """Straight rays through the transparent object, all sets jointly."""

@@ -108,6 +108,7 @@ def transmittance_plan(settings: TransmittanceSettings, schedule: ScheduleSettin
         means_lr_steps=min(schedule.means_lr_steps, length),
     )
     base = replace(schedule, densify_until=min(schedule.densify_until, start)) if settings.freeze_base else schedule
-    share = settings.wall.openings if settings.wall.light == "fresnel" else 0.0
-    judged = start + max(round(share * length), 1) if share > 0 else start
+    judged = start + max(round(settings.wall.openings * length), 1)
+    never = settings.wall.openings == 0 or settings.wall.light != "fresnel" or settings.first_bounce == "none"
+    judged = start if never or judged >= schedule.total else judged
     return TransmittancePlan(start, judged, own, base)

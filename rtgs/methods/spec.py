@@ -183,7 +183,8 @@ class MethodSpec:
 
     def _reads_loss(self, loss: str, settings: MethodSettings) -> bool:
         weight = getattr(settings.loss, loss)
-        return any(getattr(stage.reads(settings).loss, loss) == weight for stage in self.stages)
+        stages = (stage for stage in self.stages if stage.on(settings))
+        return any(getattr(stage.reads(settings).loss, loss) == weight for stage in stages)
 
     def before(self, name: str, settings: MethodSettings, schedule: ScheduleSettings) -> Stage:
         """The stage that goes on to the end of a run where the stage ``name`` turns out to have no object."""

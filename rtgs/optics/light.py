@@ -46,7 +46,7 @@ def encoded_twin(light: Tensor) -> Tensor:
 
 def _filled(kernel: str, *given: Tensor) -> Tensor:
     """What a native kernel makes of contiguous numbers: as many, of the same shape."""
-    result = torch.empty(given[0].shape)
+    result = torch.empty(given[0].shape, dtype=torch.float32)
     getattr(core, kernel)(*(each.numpy() for each in given), result.numpy(), torch.get_num_threads())
     return result
 

@@ -72,4 +72,6 @@ class WallSettings:
         refuse_unless(
             0 <= self.openings < 1, "method.transmittance.wall.openings", self.openings, "between 0 (never) and 1"
         )
+        key = "method.transmittance.wall.opening_gain"
+        refuse_unless(self.opening_gain < 1, key, self.opening_gain, "below 1: no error falls by more")
         refuse_unless(0 < self.cover <= 1, "method.transmittance.wall.cover", self.cover, "above 0 and at most 1")

@@ -73,14 +73,30 @@ def test_not_a_number_is_handed_on_and_nothing_else_becomes_one(curve):
 def test_threads_change_no_bit(curve):
     given = 2 * torch.rand(3, 40_001, generator=torch.Generator().manual_seed(0))
     before, found = torch.get_num_threads(), []
-    for threads in (1, 2, 3):
-        torch.set_num_threads(threads)
-        leaf = given.clone().requires_grad_()
-        result = curve(leaf, "linear")
-        result.sum().backward()
-        found.append((result.detach(), leaf.grad))
-    torch.set_num_threads(before)
+    try:
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            leaf = given.clone().requires_grad_()
+            result = curve(leaf, "linear")
+            result.sum().backward()
+            found.append((result.detach(), leaf.grad))
+    finally:
+        torch.set_num_threads(before)
     assert all(torch.equal(one, other) for each in found[1:] for one, other in zip(found[0], each, strict=True))
+
+
+@pytest.mark.parametrize("curve", [decoded, encoded])
+def test_any_shape_and_stride_will_do(curve):
+    whole = torch.rand(6, 5, generator=torch.Generator().manual_seed(0))
+    expected = curve(whole, "linear")
+    assert torch.equal(curve(whole.T, "linear"), expected.T)
+    assert torch.equal(curve(whole[::2, 1], "linear"), expected[::2, 1])
+    assert curve(whole[:0], "linear").shape == (0, 5)
+    single = whole[0, 0].clone().requires_grad_()
+    curve(single.expand(7), "linear").sum().backward()
+    alone = whole[0, 0].clone().requires_grad_()
+    curve(alone, "linear").backward()
+    torch.testing.assert_close(single.grad, 7 * alone.grad)
 
 
 def test_other_sizes_are_refused():

@@ -225,8 +225,7 @@ class Glass(Part):
         straight = glass_rays(glass, chosen.index, rays.center, rays.directions)
         inner = None
         if self.wall is not None:
-            if frame.step < self.plan.judged:
-                self.wall.probe(frame.step if frame.training else None)
+            self.wall.set_for(frame.step if frame.training and frame.step < self.plan.judged else None)
             inner = self.wall.inner_rays(frame.camera, straight, chosen.index[straight.rows])
         met = mirror.reflect(frame, chosen, glass.flat, None if inner is None else inner.leaving)
         reflection, transmission = self.weights(met, glass.inside[chosen.index], frame.camera, chosen.index)

@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from rtgs.core.decisions import Decision
-from rtgs.mesh.container import ObjectGuide, ObjectMesh
+from rtgs.core.upward import find_up
+from rtgs.mesh.container import ObjectMesh
 from rtgs.mesh.panels import parts_between_creases
 from rtgs.methods.parts.glass_evidence import masked_views
 
@@ -26,8 +27,10 @@ Shown = Callable[["View", Tensor], Tensor]
 """The (3, H, W) picture of a view with these faces (F,) bool as openings."""
 
 _VIEWS = 12  # that are looked at
-_UPRIGHT = 0.7  # cosine between what looks up and the cameras' mean upward direction
-_FEWEST = 200  # masked pixels of all these views that show a part
+_UPRIGHT = 0.7  # of its area that a part which looks up has in its vertical projection
+_MOST = 0.5  # share of the mesh's area that an opening has at most
+_FEWEST = 0.002  # share of the masked pixels of all these views that a wall in the part makes a difference to
+_DIFFERENCE = 1 / 255
 _PART, _FOUND = "openings.part", "openings.found"  # in the state
 
 
@@ -49,13 +52,13 @@ class Openings:
     def decisions(self) -> tuple[Decision, ...]:
         """What was found open."""
         return tuple(
-            Decision("an opening", f"no wall in {share:.0%} of the object's mesh: the error there falls by {gain:.0%}")
+            Decision("an opening", f"no wall in {share:.1%} of the object's mesh: error {-gain:+.1%} without one")
             for share, gain in self.found.tolist()
             if gain >= self.least
         )
 
     def __str__(self) -> str:
-        said = [f"{share:.0%} of the mesh, error without a wall {-gain:+.1%}" for share, gain in self.found.tolist()]
+        said = [f"{share:.1%} of the mesh, error without a wall {-gain:+.1%}" for share, gain in self.found.tolist()]
         return f"{int((self.found[:, 1] >= self.least).sum())} of {len(said)} parts ({'; '.join(said)})"
 
     def state(self) -> dict[str, Tensor]:
@@ -69,38 +72,39 @@ class Openings:
 
 
 def upward_parts(mesh: ObjectMesh, views: Sequence[View]) -> list[Tensor]:
-    """(F,) bool each: parts of the mesh that look up, as things that are open stand; the largest part is no opening."""
+    """(F,) bool each: parts of the mesh that look up, as things that are open stand; none is more than half of it."""
     normals = mesh.mesh.face_normals()
-    up = -torch.stack([view.camera.rotation[1] for view in views]).double().sum(0).numpy()
-    found = []
-    for part in parts_between_creases(mesh.mesh, mesh.voxel)[1:]:
-        mean = normals[part].sum(0)
-        if mean @ up > _UPRIGHT * np.linalg.norm(mean) * np.linalg.norm(up):
-            found.append(torch.from_numpy(part))
-    return found
+    area = np.linalg.norm(normals, axis=1)
+    up, _ = find_up(np.stack([view.camera.rotation.double().numpy() for view in views]))
+    parts = parts_between_creases(mesh.mesh, mesh.voxel)
+    return [
+        torch.from_numpy(part)
+        for part in parts
+        if normals[part].sum(0) @ up > _UPRIGHT * area[part].sum() and area[part].sum() <= _MOST * area.sum()
+    ]
 
 
 @torch.no_grad()
 def judged_openings(
-    guide: ObjectGuide, parts: Sequence[Tensor], views: Sequence[View], shown: Shown, least: float
+    mesh: ObjectMesh, parts: Sequence[Tensor], views: Sequence[View], shown: Shown, least: float
 ) -> Openings | None:
-    """Show the views with and without a wall in each of the ``parts`` (F,) bool; None: no view shows one."""
-    area = torch.from_numpy(np.linalg.norm(guide.mesh.mesh.face_normals(), axis=1))
+    """Show the views with and without a wall in each of the ``parts`` (F,) bool, and compare with the photos where that
+    makes a difference. None: it makes none, or there is no part."""
+    area = torch.from_numpy(np.linalg.norm(mesh.mesh.face_normals(), axis=1))
     masked = list(masked_views(views))
     masked = [masked[k] for k in sorted({round(k) for k in np.linspace(0, len(masked) - 1, _VIEWS)})] if masked else []
     none, gains = torch.zeros(len(area), dtype=torch.bool), []
     walls = [shown(view, none) for view, _ in masked] if parts else []
+    every = sum(int(mask.sum()) for _, mask in masked)
     for part in parts:
         pixels, closed, opened = 0, 0.0, 0.0
         for (view, mask), wall in zip(masked, walls, strict=True):
-            surfaces = guide.surfaces(view.camera)
-            where = mask & surfaces.hit & part[surfaces.triangle.clamp_min(0).long()]
-            if not where.any():
-                continue
+            without = shown(view, part)
+            where = mask & ((without - wall).abs().amax(0) > _DIFFERENCE)
             pixels += int(where.sum())
             closed += _error(wall, view, where)
-            opened += _error(shown(view, part), view, where)
-        if pixels >= _FEWEST and closed > 0:
+            opened += _error(without, view, where)
+        if pixels >= _FEWEST * every and closed > 0:
             gains.append((part, 1 - opened / closed))
     if not gains:
         return None

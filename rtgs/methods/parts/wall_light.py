@@ -57,6 +57,7 @@ class WallLight:
         self._glass = glass
         self._views = views
         self._openings: Openings | None = None
+        self._tried: Tensor | None = None  # while it is judged
         self._opened: Tensor | None = None
         self._inner: InnerGuide | None = None
         self._guides: dict[bytes, InnerGuide] = {}
@@ -67,10 +68,17 @@ class WallLight:
             index = {"index": torch.tensor([settings.index])}
             self.group = ParameterGroup("glass", index, Rate(settings.index_rate), limits=INDEX_LIMITS)
 
-    def probe(self, step: int | None) -> None:
-        """Before it is judged, parts that may be openings are walls in even steps and openings in odd ones; None: they
-        are walls."""
-        self._open(self._upward if step is not None and step % 2 else torch.zeros_like(self._glass))
+    def set_for(self, step: int | None) -> None:
+        """The walls of a picture: what was judged; before that, in training (``step``), parts that may be openings are
+        walls in even steps and openings in odd ones; None: they are walls."""
+        if self._tried is not None:
+            return self._open(self._tried)
+        by_turns = self._openings is None and step is not None and step % 2 == 1
+        return self._open(self._upward if by_turns else self._judged)
+
+    @property
+    def _judged(self) -> Tensor:
+        return torch.zeros_like(self._glass) if self._openings is None else self._openings.faces
 
     @cached_property
     def _parts(self) -> list[Tensor]:
@@ -86,16 +94,23 @@ class WallLight:
         """Where the object is open."""
         return () if self._openings is None else self._openings.decisions
 
-    def judge(self, look: Callable[[View], Tensor]) -> Openings | None:
-        """Find the object's openings; ``look`` gives the picture of a view as the walls are. None: there is no part
-        to judge."""
+    def judge(self, look: Callable[[View], Tensor]) -> str:
+        """Find the object's openings; ``look`` gives the picture of a view as the walls are. What is to be said of it;
+        empty: nothing of the mesh looks up."""
 
         def shown(view: View, opened: Tensor) -> Tensor:
-            self._open(opened)
+            self._tried = opened
             return look(view)
 
-        self._adopt(judged_openings(self._guide, self._parts, self._views, shown, self.settings.opening_gain))
-        return self._openings
+        mesh, least = self._guide.mesh, self.settings.opening_gain
+        try:
+            found = judged_openings(mesh, self._parts, self._views, shown, least)
+        finally:
+            self._tried = None
+        self._adopt(found)
+        if self._parts and self._openings is None:
+            return "none: no view tells whether what looks up is a wall"
+        return str(self._openings or "")
 
     def state(self) -> dict[str, Tensor]:
         """For a checkpoint: what was judged."""
@@ -107,7 +122,8 @@ class WallLight:
 
     def _adopt(self, found: Openings | None) -> None:
         self._openings = found
-        self._open(torch.zeros_like(self._glass) if found is None else found.faces)
+        self._guides.clear()
+        self._open(self._judged)
 
     def _open(self, faces: Tensor) -> None:
         """Faces (F,) bool of the mesh are openings, where no wall is; all others are walls."""

@@ -12,10 +12,11 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from rtgs.core.errors import RtgsError
+from rtgs.core.upward import find_up
 from rtgs.prepare.poses import pairs
 from rtgs.prepare.poses.compare import compare_poses
 from rtgs.prepare.poses.quality import Evidence, advise, azimuth_gap, groups_of
-from rtgs.prepare.poses.world import choose_world, find_up
+from rtgs.prepare.poses.world import choose_world
 from rtgs.prepare.settings import MatchingSettings, SfmSettings, VideoSettings, WorldSettings
 from rtgs.scenes.capture import CaptureView
 from tests.prepare.room import look, walk
