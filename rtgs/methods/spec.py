@@ -160,7 +160,7 @@ class MethodSpec:
         return next((stage for stage in self.stages if stage.needs_object and stage.on(settings)), None)
 
     def unread_losses(self, settings: MethodSettings) -> tuple[Decision, ...]:
-        """The weights of losses that are above 0 and that no stage reads.
+        """The weights of losses that are above 0 and that no stage of the method reads, whether it is on or not.
 
         In the place of what it does not read a stage has the dataclass's default, so a weight of that value is not
         among them.
@@ -183,8 +183,7 @@ class MethodSpec:
 
     def _reads_loss(self, loss: str, settings: MethodSettings) -> bool:
         weight = getattr(settings.loss, loss)
-        stages = (stage for stage in self.stages if stage.on(settings))
-        return any(getattr(stage.reads(settings).loss, loss) == weight for stage in stages)
+        return any(getattr(stage.reads(settings).loss, loss) == weight for stage in self.stages)
 
     def before(self, name: str, settings: MethodSettings, schedule: ScheduleSettings) -> Stage:
         """The stage that goes on to the end of a run where the stage ``name`` turns out to have no object."""
