@@ -2,7 +2,8 @@
 
 Compared are the first and second stages of the four methods on ball_statue and toycar, preset ``smoke`` and 300 steps
 of ``quick``. ``golden_checkpoints.json`` holds their digests by step and key, and those of fox, which no case trains.
-One instruction set and one PyTorch made them; on others, bits differ, and the test is skipped. When a recipe or a
+One instruction set and one PyTorch made them; on others, bits differ, and the test is skipped. A stage that gets a new
+version gets new keys, and keeps its digests here where its bits are the old ones. When a recipe or a
 result is meant to change, its lines go.
 """
 
