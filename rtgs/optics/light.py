@@ -22,14 +22,18 @@ def decoded(color: Tensor, blend: str) -> Tensor:
     """Linear light of encoded colours; the curve goes on above 1, the line below 0."""
     if blend == "srgb":
         return color
-    return _Decode.apply(color) if color.dtype == torch.float32 else decoded_twin(color)  # type: ignore[return-value]
+    if color.dtype != torch.float32:
+        return decoded_twin(color)
+    return _Curve.apply(color, "srgb_decode")  # type: ignore[return-value]
 
 
 def encoded(light: Tensor, blend: str) -> Tensor:
     """The inverse of :func:`decoded`."""
     if blend == "srgb":
         return light
-    return _Encode.apply(light) if light.dtype == torch.float32 else encoded_twin(light)  # type: ignore[return-value]
+    if light.dtype != torch.float32:
+        return encoded_twin(light)
+    return _Curve.apply(light, "srgb_encode")  # type: ignore[return-value]
 
 
 def decoded_twin(color: Tensor) -> Tensor:
@@ -51,27 +55,15 @@ def _filled(kernel: str, *given: Tensor) -> Tensor:
     return result
 
 
-class _Decode(torch.autograd.Function):
+class _Curve(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, color: Tensor) -> Tensor:
-        color = color.detach().contiguous()
-        ctx.save_for_backward(color)
-        return _filled("srgb_decode", color)
+    def forward(ctx, values: Tensor, kernel: str) -> Tensor:
+        values = values.detach().contiguous()
+        ctx.save_for_backward(values)
+        ctx.kernel = kernel
+        return _filled(kernel, values)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, upstream: Tensor) -> Tensor:  # type: ignore[override]
-        return _filled("srgb_decode_backward", *ctx.saved_tensors, upstream.contiguous())
-
-
-class _Encode(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, light: Tensor) -> Tensor:
-        light = light.detach().contiguous()
-        ctx.save_for_backward(light)
-        return _filled("srgb_encode", light)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, upstream: Tensor) -> Tensor:  # type: ignore[override]
-        return _filled("srgb_encode_backward", *ctx.saved_tensors, upstream.contiguous())
+    def backward(ctx, upstream: Tensor):  # type: ignore[override]
+        return _filled(f"{ctx.kernel}_backward", *ctx.saved_tensors, upstream.contiguous()), None

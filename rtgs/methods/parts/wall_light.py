@@ -57,12 +57,15 @@ class WallLight:
         self._glass = glass
         self._views = views
         self._openings: Openings | None = None
+        self._closed = torch.zeros_like(glass)
+        self._judged = self._closed  # (F,) bool: openings as they were judged
         self._tried: Tensor | None = None  # while it is judged
         self._opened: Tensor | None = None
+        self._any = False  # face is open
         self._inner: InnerGuide | None = None
         self._guides: dict[bytes, InnerGuide] = {}
         self._follow = settings.bounces > 0 and not guide.mesh.flat
-        self._open(torch.zeros_like(glass))
+        self._open(self._closed)
         self.group: ParameterGroup | None = None
         if settings.index_rate > 0:
             index = {"index": torch.tensor([settings.index])}
@@ -75,10 +78,6 @@ class WallLight:
             return self._open(self._tried)
         by_turns = self._openings is None and step is not None and step % 2 == 1
         return self._open(self._upward if by_turns else self._judged)
-
-    @property
-    def _judged(self) -> Tensor:
-        return torch.zeros_like(self._glass) if self._openings is None else self._openings.faces
 
     @cached_property
     def _parts(self) -> list[Tensor]:
@@ -122,23 +121,27 @@ class WallLight:
 
     def _adopt(self, found: Openings | None) -> None:
         self._openings = found
+        self._judged = self._closed if found is None else found.faces
         self._guides.clear()
         self._open(self._judged)
 
     def _open(self, faces: Tensor) -> None:
         """Faces (F,) bool of the mesh are openings, where no wall is; all others are walls."""
-        if self._opened is not None and torch.equal(self._opened, faces):
+        if self._opened is not None and (self._opened is faces or torch.equal(self._opened, faces)):
             return
-        self._opened = faces
+        self._opened, self._any = faces, bool(faces.any())
         if self._follow:
             key = faces.numpy().tobytes()
             before = self._guides.pop(key, None)
             self._inner = before or InnerGuide(self._guide.mesh, self._glass, self.settings.bounces, faces)
             self._guides = {**dict([*self._guides.items()][-1:]), key: self._inner}  # the last two
 
-    def walls(self, camera: Camera, pixels: Tensor) -> Tensor:
-        """(P,) float32 of flattened pixels (P,): 1, or 0 where the object's first surface is an opening."""
+    def walls(self, camera: Camera, pixels: Tensor) -> Tensor | float:
+        """(P,) float32 of flattened pixels (P,): 1, or 0 where the object's first surface is an opening; 1: nothing is
+        open."""
         assert self._opened is not None
+        if not self._any:
+            return 1.0
         triangle = self._guide.surfaces(camera).triangle.flatten()[pixels].long()
         return 1 - (self._opened[triangle.clamp_min(0)] & (triangle >= 0)).float()
 
@@ -154,7 +157,7 @@ class WallLight:
         specular = torch.where(glass.known, specular, glass.flat.specular)
         return replace(glass, flat=replace(glass.flat, specular=specular))
 
-    def weights(self, reflection: Tensor, cosine: Tensor, rows: Tensor, walls: Tensor) -> tuple[Tensor, Tensor]:
+    def weights(self, reflection: Tensor, cosine: Tensor, rows: Tensor, walls: Tensor | float) -> tuple[Tensor, Tensor]:
         """w_r and w_t of P traced pixels: R and 1 - R in ``rows``, elsewhere ``reflection`` (P,) or (3, P), and 0.
         ``walls``: of these rows, as :meth:`walls` has them; R is 0 where there is none."""
         reflected = walls * wall_reflectance(cosine.index_select(0, rows), self.index)
