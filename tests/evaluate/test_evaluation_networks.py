@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,9 +9,9 @@ import pytest
 from rtgs.evaluate import networks
 from rtgs.evaluate.networks import check_networks
 from rtgs.evaluate.settings import EvaluationSettings
-from rtgs.pretrained import weights
 from rtgs.pretrained.keys import ABSENT
 from rtgs.pretrained.weights import LPIPS_VGG, VGG16, MissingWeights, WrongWeights
+from tests.small_networks import look_in, put
 
 ON = EvaluationSettings()
 BOTH = (("lpips_vgg", "2" * 64), ("vgg16", "1" * 64))
@@ -21,21 +19,10 @@ NONE = (("lpips_vgg", ABSENT), ("vgg16", ABSENT))
 HALF = (("lpips_vgg", ABSENT), ("vgg16", "1" * 64))
 
 
-def put(folder: Path, *files: weights.PretrainedFile) -> None:
-    for file in files:
-        (folder / file.filename).parent.mkdir(parents=True, exist_ok=True)
-        (folder / file.filename).write_bytes(file.name.encode())
-
-
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The one place where weights are looked for; the registered digests are those of :func:`put`."""
-    monkeypatch.setattr(weights, "weight_folders", lambda: (tmp_path,))
-    for name in ("VGG16", "LPIPS_VGG"):
-        file = getattr(networks, name)
-        small = replace(file, sha256=hashlib.sha256(file.name.encode()).hexdigest())
-        monkeypatch.setattr(networks, name, small)
-    return tmp_path
+    """The one place where weights are looked for."""
+    return look_in(tmp_path, networks, monkeypatch)
 
 
 def test_an_evaluation_has_the_networks_of_its_key(folder: Path):

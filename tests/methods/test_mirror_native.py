@@ -2,27 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import pytest
 import torch
 from torch import Tensor
 
 from rtgs.methods.shading.mirror import SHORTEST_NORMAL, SurfacePixels, mirror_rays, mirror_rays_twin
-from rtgs.native import core
 from rtgs.optics.microfacet import specular_weights
 from rtgs.optics.reflection import reflection_weight
 from rtgs.optics.settings import OpticsSettings
 
 COUNTS = (0, 1, 15, 16, 33, 500)
-
-
-@pytest.fixture(params=core.available_isas())
-def isa(request: pytest.FixtureRequest) -> Iterator[str]:
-    before = core.isa()
-    core.select_isa(request.param)
-    yield request.param
-    core.select_isa(before)
 
 
 def drawn_pixels(count: int) -> tuple[SurfacePixels, Tensor, Tensor]:

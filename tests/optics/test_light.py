@@ -1,7 +1,5 @@
 """The two lights in which colours may be mixed."""
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 import torch
@@ -34,14 +32,6 @@ def test_a_half_mirror_of_white_over_black_is_half_the_light():
     white = torch.ones(3, 1)
     assert float(specular_change(pixels, white, None)[0]) == 0.5
     assert abs(float(specular_change(pixels, white, None, "linear")[0]) - 0.735357) < 1e-5, "sRGB of half the light"
-
-
-@pytest.fixture(params=core.available_isas())
-def isa(request: pytest.FixtureRequest) -> Iterator[str]:
-    before = core.isa()
-    core.select_isa(request.param)
-    yield request.param
-    core.select_isa(before)
 
 
 @pytest.mark.usefixtures("isa")

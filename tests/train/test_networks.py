@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from rtgs.pretrained import weights
 from rtgs.pretrained.weights import LPIPS_VGG, VGG16, MissingWeights, WrongWeights
 from rtgs.train import networks
 from rtgs.train.networks import check_networks, named_in_key, networks_of
 from rtgs.train.settings import LossSettings
+from tests.small_networks import look_in, put
 
 LPIPS = LossSettings(perceptual=0.01)
 L1 = replace(LPIPS, perceptual_form="vgg_l1")
@@ -20,21 +19,10 @@ VGG_NAMED, HEADS_NAMED = (("vgg16", "1" * 64), ("lpips_vgg", "2" * 64))
 BOTH = (VGG_NAMED, HEADS_NAMED)
 
 
-def put(folder: Path, *files: weights.PretrainedFile) -> None:
-    for file in files:
-        (folder / file.filename).parent.mkdir(parents=True, exist_ok=True)
-        (folder / file.filename).write_bytes(file.name.encode())
-
-
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The one place where weights are looked for; the registered digests are those of :func:`put`."""
-    monkeypatch.setattr(weights, "weight_folders", lambda: (tmp_path,))
-    for name in ("VGG16", "LPIPS_VGG"):
-        file = getattr(networks, name)
-        small = replace(file, sha256=hashlib.sha256(file.name.encode()).hexdigest())
-        monkeypatch.setattr(networks, name, small)
-    return tmp_path
+    """The one place where weights are looked for."""
+    return look_in(tmp_path, networks, monkeypatch)
 
 
 def test_a_form_reads_its_own_files():
