@@ -77,7 +77,7 @@ def execute(config: RunConfig, choices: Choices, membership: Membership | None =
     membership.outcomes.check(plan)
     for step in graph.skipped:
         log.info("no %s step: %s", step.what, step.why)
-    for decision in graph.unread:
+    for decision in (*graph.unread, *graph.moved):
         log.info("%s", decision)
     log.info("%s", describe(plan))
     run = _Run(config, choices, plan, command(choices), store, remote, open_tracker(config), membership)

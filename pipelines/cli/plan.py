@@ -28,7 +28,7 @@ def plan_of_words(words: Sequence[str]) -> int:
         config = job.config
         graph = build_graph(config, job.choices)
         plan = make_plan(graph.targets, Store(config.paths.store), remote_store(config))
-        print("\n".join([single_table(graph, plan), "", *map(str, graph.unread), describe(plan)]))
+        print("\n".join([single_table(graph, plan), "", *map(str, (*graph.unread, *graph.moved)), describe(plan)]))
         return 0
     problems = [(job.title, job.problem) for job in jobs if job.config is None]
     ready = [ready_job(job) for job in jobs if job.config is not None]

@@ -62,6 +62,7 @@ class RunGraph:
     mesh: Step | None = None
     skipped: tuple[Decision, ...] = ()  # ``what`` is the name of the step
     unread: tuple[Decision, ...] = ()  # what the settings ask for and no step does
+    moved: tuple[Decision, ...] = ()  # what begins at another time than in other scenes
 
     @property
     def targets(self) -> tuple[Step, ...]:
@@ -100,9 +101,10 @@ def build_graph(config: RunConfig, choices: Choices, inspections: Inspections | 
         mesh = extract_mesh.STEP.step(_mesh_params(config), scene, *training)
     made = (rendered, measured) if mesh is None else (mesh, rendered, measured)
     unread = find_method(config.method.name).unread_losses(config.method)
-    params = _report_params(config, choices, skipped, unread)
+    moved = _moved_starts(config, transparency.present)
+    params = _report_params(config, choices, skipped, (*unread, *moved))
     page = report.STEP.step(params, *prepared.steps, scene, *training, *made)
-    return RunGraph(scene, training, rendered, measured, page, mesh, skipped, unread)
+    return RunGraph(scene, training, rendered, measured, page, mesh, skipped, unread, moved)
 
 
 def _as_asked(config: RunConfig) -> RunConfig:
@@ -133,6 +135,7 @@ def _training(config: RunConfig, prepared: Preparation, transparent: bool) -> tu
     steps: list[Step] = []
     object_mesh = None
     spec = find_method(method.name)
+    method = method.in_scene(glass=_through_glass(config, transparent))
     networks = tuple(found for found in _pretrained() if found[1] != ABSENT)  # without them the key stays as it was
     for stage in spec.timeline(method, config.schedule, transparent=transparent):
         own = spec.stage(stage.name)
@@ -144,6 +147,21 @@ def _training(config: RunConfig, prepared: Preparation, transparent: bool) -> tu
         mesh = () if object_mesh is None else (object_mesh,)
         steps.append(train.train_step(spec, params, scene, *steps, *mesh, networks=networks))
     return tuple(steps), object_mesh
+
+
+def _through_glass(config: RunConfig, transparent: bool) -> bool:
+    """Whether a stage for the transparent object is asked for, and there is one."""
+    return transparent and find_method(config.method.name).object_stage(config.method) is not None
+
+
+def _moved_starts(config: RunConfig, transparent: bool) -> tuple[Decision, ...]:
+    """What begins at another time than in other scenes."""
+    reflection = config.method.reflection
+    start = config.method.in_scene(glass=_through_glass(config, transparent)).reflection.start
+    if start == reflection.start:
+        return ()
+    why = f"the scene has a transparent object (method.reflection.start_before_glass; else {reflection.start:g})"
+    return (Decision(f"reflection from {start:g} of the run on", why),)
 
 
 def _mesh_params(config: RunConfig) -> extract_mesh.ExtractMeshParams:
@@ -171,13 +189,13 @@ def method_label(choices: Choices) -> str:
 
 
 def _report_params(
-    config: RunConfig, choices: Choices, skipped: tuple[Decision, ...], unread: tuple[Decision, ...]
+    config: RunConfig, choices: Choices, skipped: tuple[Decision, ...], noted: tuple[Decision, ...]
 ) -> report.ReportParams:
     values, defaults = shown_values(config), shown_values(RunConfig())
     lines = {key: (str(values[key]), str(defaults.get(key, ""))) for key in sorted(values)}
     title = f"{config.scene.name}: {method_label(choices)}, {choices.preset}"
     decisions = [(f"no {step.what} step", step.why) for step in skipped]
-    decisions += [(each.what, each.why) for each in unread]
+    decisions += [(each.what, each.why) for each in noted]
     return report.ReportParams(title, command(choices), lines, tuple(decisions))
 
 

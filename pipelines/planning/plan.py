@@ -58,7 +58,7 @@ def merge_jobs(jobs: Sequence[Job]) -> MergedJobs:
             needed_by[step.fingerprint] = (*needed_by.get(step.fingerprint, ()), job.title)
         for step in graph.skipped:
             skipped[step] = (*skipped.get(step, ()), job.title)
-        for decision in graph.unread:
+        for decision in (*graph.unread, *graph.moved):
             unread[decision] = (*unread.get(decision, ()), job.title)
     return MergedJobs(tuple(targets), needed_by, skipped, unread, tuple(problems))
 

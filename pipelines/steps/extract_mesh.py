@@ -284,4 +284,4 @@ def _sizes(mesh: TriangleMesh) -> dict[str, float]:
     return {"mesh/vertices": float(len(mesh.vertices)), "mesh/triangles": float(len(mesh.faces))}
 
 
-STEP = StepKind("extract_mesh", 6, extract_mesh)
+STEP = StepKind("extract_mesh", 7, extract_mesh)

@@ -18,6 +18,7 @@ from rtgs.mesh.guide import MeshGuide
 from rtgs.mesh.lathe import COLUMNS, Axis, lathe_shape, node_of
 from rtgs.mesh.operators import MeshShape
 from rtgs.mesh.rims import RimView, find_rims
+from rtgs.mesh.stretches import Samples, straightened
 from rtgs.mesh.triangles import TriangleMesh
 
 _SPACING = 0.5  # voxels between nodes of the profile
@@ -43,6 +44,7 @@ class Revolution:
     profile: np.ndarray  # (K, 2) radius and height, from below to above, both ends on the axis
     seen: np.ndarray  # (K,) bool: rims come near
     length: float  # voxels: smoothing length
+    straight: int = 0  # stretches between edges that were made straight
 
     def mesh(self) -> TriangleMesh:
         return lathe_shape(self.profile, self.axis).mesh()
@@ -70,7 +72,9 @@ def fit_revolution(
             length = system.best_length()
         profile, axis = system.moved(system.solved(length, *system.gathered(np.ones(len(system.rims), bool))))
         profile = _with_feet(profile, seen, foot_degrees)
-    return Revolution(axis, profile, seen, length)
+    system = _System(resampled(profile, count), axis, voxel, views)
+    lines = straightened(system.profile, system.normal, system.sharpness(), system.told(), _TIE)
+    return Revolution(axis, lines.profile, seen, length, len(lines.stretches))
 
 
 def normals_axis(shape: MeshShape) -> Axis:
@@ -184,6 +188,10 @@ class _System:
         rows = self.rows[chosen]
         weighted = rows.multiply(self.weight[chosen][:, None]).tocsr()
         return (weighted.T @ rows).toarray(), weighted.T @ self.rims.offset[chosen]
+
+    def told(self) -> Samples:
+        """What the rims say of the nodes."""
+        return Samples(self.samples.toarray(), self.rims.offset, self.weight)
 
     @property
     def seen(self) -> np.ndarray:

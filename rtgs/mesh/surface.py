@@ -88,6 +88,7 @@ def _candidates(hull: HullResult, views: list[RimView], settings: SurfaceSetting
         turned = fit_revolution(hull.mesh, hull.voxel, views, settings.foot_degrees)
         if turned is not None:
             said = f"a surface of revolution, its profile smoothed over {turned.length:g} voxels"
+            said += "" if turned.straight == 0 else f", straight between edges in {turned.straight} places"
             unseen = 1 - float(turned.seen.mean())
             yield _Candidate(turned.mesh(), "revolution", said, strength=turned.length, unseen=unseen)
         flat = fit_planes(hull.mesh, hull.voxel, views, settings.tolerance)

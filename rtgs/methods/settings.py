@@ -5,7 +5,7 @@ Boundaries are shares of the run (``schedule.total``), intervals are steps.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from rtgs.core.errors import RtgsError
@@ -90,6 +90,8 @@ class ReflectionSettings:
     """
 
     start: float = 0.05  # share of the run: 3,000 of 60,000
+    # At the latest in scenes with a transparent object, whose stage needs the time; None: at ``start``.
+    start_before_glass: float | None = field(default=None, metadata=UNLESS_DEFAULT)
     densify_until: float = 0.35  # 21,000 of 60,000
     densify_every: int = 500
     opacity_reset_every: int = 6_000  # 0 = never; only while densifying
@@ -125,9 +127,9 @@ class ReflectionSettings:
     def __post_init__(self) -> None:
         refuse_bad_numbers(self, "method.reflection")
         refuse_unknown_words(self, "method.reflection")
-        for name in ("start", "densify_until"):
+        for name in ("start", "start_before_glass", "densify_until"):
             value = getattr(self, name)
-            refuse_unless(0 <= value <= 1, f"method.reflection.{name}", value, "between 0 and 1")
+            refuse_unless(value is None or 0 <= value <= 1, f"method.reflection.{name}", value, "between 0 and 1")
         for name in ("densify_every", "sh_every", "cells", "per_cell", "rebuild_every"):
             value = getattr(self, name)
             refuse_unless(value >= 1, f"method.reflection.{name}", value, "at least 1")
@@ -214,6 +216,9 @@ class TransmittanceSettings:
     # Base surfels in the object begin as its contents with an opacity of at most this, so that light can take the place
     # of those that stood for it (docs/lab/glass_light.md). 1: as they are.
     start_opacity: float = field(default=1.0, metadata=UNLESS_DEFAULT)
+    # How the eye sees the contents: by rays through pixel centres, or by the rasteriser, which misses no small surfel
+    # (where :attr:`MethodSettings.single_rays` is empty).
+    contents: Literal["traced", "rasterized"] = field(default="traced", metadata=UNLESS_DEFAULT)
     keep_seen: int = 3  # views that see a surfel bare, from which on it stays in the base set too; 0: all go
     sh_degree: int = 3  # of the transmittance set, at most
     split: bool = True  # base surfels inside the mesh become the transmittance set; the paper: a random set (False)
@@ -280,3 +285,18 @@ class MethodSettings:
                 "method.transmittance.wall.light=fresnel gives shares of linear light, but "
                 f"method.optics.blend={self.optics.blend}: set it to linear, or wall.light=learned"
             )
+
+    @property
+    def single_rays(self) -> str:
+        """The key that reads the hits of single rays in the contents, and its value; empty: none does."""
+        if self.transmittance.first_bounce_end == "clip":
+            return "method.transmittance.first_bounce_end=clip"
+        if self.loss.transmission_depth > 0 and self.loss.transmission_depth_form == "per_hit":
+            return "method.loss.transmission_depth_form=per_hit"
+        return ""
+
+    def in_scene(self, *, glass: bool) -> MethodSettings:
+        """As they are in a scene in which the stage for transparent objects runs (``glass``), or does not."""
+        start, latest = self.reflection.start, self.reflection.start_before_glass
+        start = start if latest is None or not glass else min(start, latest)
+        return replace(self, reflection=replace(self.reflection, start=start, start_before_glass=None))

@@ -94,5 +94,6 @@ def test_no_ablation_restates_what_its_methods_have(ablation):
 def test_glass_has_the_numbers_of_the_schema():
     """rtgs alone reads them: with its published preset they are the dataclass's own, but for the light of its walls."""
     config, _ = compose(["scene=demo", "method=rtgs", "preset=paper"])
-    walls = TransmittanceSettings(normal="mesh", start_opacity=0.1, wall=WallSettings(light="fresnel", openings=0.25))
-    assert config.method.transmittance == walls
+    walls = WallSettings(light="fresnel", openings=0.25)
+    beyond = TransmittanceSettings(normal="mesh", start_opacity=0.1, contents="rasterized", wall=walls)
+    assert config.method.transmittance == beyond

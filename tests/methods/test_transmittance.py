@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -319,6 +320,47 @@ def test_a_killed_stage_goes_on_bit_for_bit(made: GlassScene, tmp_path: Path):
         resumed.load(second)
 
 
+@pytest.mark.parametrize("size", [0.25, 0.004], ids=["large", "smaller than a pixel"])
+def test_contents_are_the_same_traced_and_rasterised_but_none_is_missed(made: GlassScene, size: float):
+    camera = made.scene.test[0].camera
+    shown = []
+    for contents in ("traced", "rasterized"):
+        method = begun(glass_recipe(contents=contents), made)
+        gaussians = method["transmittance"].gaussians
+        with torch.no_grad():
+            gaussians.opacity_logits.fill_(-20.0)
+            gaussians.opacity_logits[0] = 3.0
+            gaussians.means[0] = torch.tensor([0.013, 0.007, 0.021])
+            gaussians.log_scales[0] = math.log(size)
+            toward = torch.nn.functional.normalize(camera.center.float() - gaussians.means[0], dim=0)
+            half = torch.nn.functional.normalize(toward + torch.tensor([0.0, 0.0, 1.0]), dim=0)
+            gaussians.quaternions[0] = torch.cat([torch.zeros(1), half])  # half a turn takes z to the camera
+            gaussians.sh_dc[0] = 1.0
+            gaussians.sh_rest[0] = 0.0
+            method["base"].gaussians.opacity_logits.fill_(-20.0)
+            layers = method.render(
+                camera, 40, Mode.EVALUATE, RenderOptions(layers=True), made.scene.test[0].mask
+            ).layers
+        shown.append(layers["transmission"])
+    traced, rasterized = shown
+    assert float(rasterized.max()) > 0.05
+    if size > 0.1:
+        assert float((traced - rasterized).abs().max()) < 0.02
+    else:
+        assert float(traced.sum()) < 0.5 * float(rasterized.sum())
+
+
+def test_what_reads_single_rays_gets_them(made: GlassScene):
+    clipped = begun(glass_recipe(contents="rasterized", first_bounce_end="clip"), made)
+    assert [each.what for each in clipped.decisions if "contents" in each.what] == ["contents are traced"]
+    traced = begun(glass_recipe(first_bounce_end="clip"), made)
+    view = made.scene.test[0]
+    with torch.no_grad():
+        images = [m.render(view.camera, 40, Mode.EVALUATE, RenderOptions(), view.mask).image for m in (clipped, traced)]
+    assert torch.equal(*images)
+    assert not any("contents" in each.what for each in traced.decisions)
+
+
 @pytest.mark.parametrize(
     "changes",
     [
@@ -328,6 +370,8 @@ def test_a_killed_stage_goes_on_bit_for_bit(made: GlassScene, tmp_path: Path):
         {"second_bounce": "first_bounce", "freeze_base": False},
         {"compositing": "sum", "box": "scene", "split": False, "test_masks": "given"},
         {"first_bounce_end": "clip", "second_bounce_gradient": False, "second_offset": 0.0},
+        {"contents": "rasterized"},
+        {"contents": "rasterized", "second_bounce": "first_bounce"},
     ],
 )
 def test_every_choice_trains(made: GlassScene, changes: dict[str, object]):

@@ -112,7 +112,9 @@ class Glass(Part):
     @property
     def decisions(self) -> tuple[Decision, ...]:
         if self._left_out is None:
-            return () if self.wall is None else self.wall.decisions
+            asking = self.settings.single_rays if self.settings.transmittance.contents == "rasterized" else ""
+            traced = (Decision("contents are traced", f"{asking} reads the hits of single rays"),) if asking else ()
+            return traced if self.wall is None else (*traced, *self.wall.decisions)
         why = "the masks of the training views are empty, or cover all of them"
         if self._left_out != NOT_MASKED:
             why = f"the masked object looks opaque: {self._left_out:.1%} of what its pixels show is its own surface "
@@ -229,7 +231,7 @@ class Glass(Part):
             inner = self.wall.inner_rays(frame.camera, straight, chosen.index[straight.rows])
         met = mirror.reflect(frame, chosen, glass.flat, None if inner is None else inner.leaving)
         reflection, transmission = self.weights(met, glass.inside[chosen.index], frame.camera, chosen.index)
-        passed = self.transmit(frame, straight, inner, met.others)
+        passed = self.transmit(frame, straight, chosen.index[straight.rows], inner, met.others)
         through = Light("transmission", "transmitted_color", transmission, passed.color, passed.parts)
         traced = Traced(
             glass.flat,
@@ -289,7 +291,12 @@ class Glass(Part):
         return glass_weights(reflection, cosine, met.pixels, inside, optics, settings.max_weight if bounded else 0.0)
 
     def transmit(
-        self, frame: Frame, rays: GlassRays, inner: InnerRays | None = None, surroundings: Tensor | None = None
+        self,
+        frame: Frame,
+        rays: GlassRays,
+        pixels: Tensor,
+        inner: InnerRays | None = None,
+        surroundings: Tensor | None = None,
     ) -> Transmission:
         """C_t of the traced pixels; ``surroundings``: what the rays met that leave the object after ``inner`` paths."""
         assert self.guide is not None
@@ -305,7 +312,7 @@ class Glass(Part):
             frame.training and own is not None and self._watching(own, frame.step),
         )
         wall = None if self.wall is None else FarWall(inner, surroundings, self.wall.index)
-        return straight.transmit(frame, rays, wall)
+        return straight.transmit(frame, rays, pixels, wall)
 
     def _own_degree(self, step: int) -> int:
         """SH degree of the transmittance set: grown on its own clock, but never below what it came with."""

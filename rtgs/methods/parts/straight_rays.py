@@ -10,6 +10,7 @@ from torch import Tensor
 from rtgs.gaussians.surfels import Surfels
 from rtgs.mesh.container import ObjectMesh
 from rtgs.methods.parts.base import BaseSet
+from rtgs.methods.parts.kinds import SURFELS, RasterRequest
 from rtgs.methods.parts.part import Frame
 from rtgs.methods.parts.traced_set import FollowingTree, TracedSet, trace_set
 from rtgs.methods.parts.wall_light import InnerRays
@@ -18,7 +19,7 @@ from rtgs.methods.shading.inner import LINEAR, TracedLeg, far_wall, inner_light
 from rtgs.methods.shading.straight import FirstBounce, GlassRays, Transmission
 from rtgs.optics.light import decoded, encoded
 from rtgs.render.buffers import TraceBuffers, TraceOptions
-from rtgs.train.method import Observation
+from rtgs.train.method import Observation, RenderOptions
 
 
 @dataclass(frozen=True)
@@ -71,13 +72,14 @@ class StraightRays:
     measured: bool
     watched: bool
 
-    def transmit(self, frame: Frame, rays: GlassRays, wall: FarWall | None = None) -> Transmission:
+    def transmit(self, frame: Frame, rays: GlassRays, pixels: Tensor, wall: FarWall | None = None) -> Transmission:
         """C_t of the traced pixels: what the first bounce meets, and behind the object the second.
 
+        ``pixels`` (R,) int64: flattened, of the rays.
         ``wall``: the object's far wall reflects light as well; None: it lets all pass.
         """
         degree = self.base.sh_degree(frame.step)
-        first, observations = self._first_bounce(rays, degree)
+        first, observations = self._first_bounce(frame, rays, pixels, degree)
         assert first.colors is not None
         color, parts = first.colors, {}
         if self.settings.transmittance.second_bounce != "none" and not self.mesh.flat:
@@ -117,9 +119,34 @@ class StraightRays:
         values = (wall.inner.by_leg(each) for each in (inside.colors, inside.alpha, wall.surroundings))
         return [TracedLeg(*each) for each in zip(*values, strict=True)]
 
-    def _first_bounce(self, rays: GlassRays, degree: int) -> tuple[TraceBuffers, tuple[Observation, ...]]:
+    def _rasterized(
+        self, frame: Frame, rays: GlassRays, pixels: Tensor
+    ) -> tuple[TraceBuffers, tuple[Observation, ...]]:
+        """The transmittance set in these flattened pixels (R,), as the rasteriser shows it: a surfel that is smaller
+        than a pixel is not missed by the ray through its centre."""
+        own = self.own
+        assert own is not None
+        probe = own.new_probe() if self.watched else None
+        wanted = RenderOptions(depth=self.measured or self.settings.transmittance.second_bounce == "first_bounce")
+        rows = own.activated(frame.camera.center.float(), self.own_degree)
+        request = RasterRequest(
+            frame.camera, wanted, self.watched, probe, torch.zeros(3), self.settings.render, self.base.extent
+        )
+        buffers = SURFELS.rasterize(rows, rows.colors, request)
+        alpha = buffers.alpha.flatten()[pixels]
+        depth = None if buffers.depth is None else buffers.depth.flatten()[pixels] - rays.near * alpha
+        met = TraceBuffers(buffers.features.flatten(1)[:, pixels].T, None, alpha, depth)
+        if probe is None or buffers.weight_sum is None:
+            return met, ()
+        return met, (Observation(own.name, probe, buffers.weight_sum),)
+
+    def _first_bounce(
+        self, frame: Frame, rays: GlassRays, pixels: Tensor, degree: int
+    ) -> tuple[TraceBuffers, tuple[Observation, ...]]:
         """Through the transmittance set, or through the base set inside the object."""
         settings = self.settings.transmittance
+        if self.own is not None and settings.contents == "rasterized" and not self.settings.single_rays:
+            return self._rasterized(frame, rays, pixels)
         thickness = rays.far - rays.near
         origins, directions = rays.at(rays.near)
         depth = self.measured or settings.second_bounce == "first_bounce"

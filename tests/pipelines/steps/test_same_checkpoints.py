@@ -22,8 +22,9 @@ from rtgs.workflow import Store
 
 GOLDEN = json.loads(Path(__file__).with_name("golden_checkpoints.json").read_text())
 CASES = [(scene, method) for scene in ("ball_statue", "toycar") for method in ("2dgs", "3dgs", "envgs", "rtgs")]
-SHORT = ("preset=quick", "schedule.total=300")
 # What the presets and rtgs have become since.
+OLD_STARTS = ("method.reflection.start_before_glass=null", "method.transmittance.start=0.5")
+SHORT = ("preset=quick", "schedule.total=300", *OLD_STARTS)
 OLD_RATES = ("method.optimizer.decay_from=1.0", "method.init.orientation=published")
 OLD_GLASS = ("ablation=learned_glass", "mesh.object.surface.fit=carved")
 

@@ -121,6 +121,27 @@ def test_only_scenes_with_masks_that_show_something_get_the_third_stage(glass: P
     assert not any(step.what == "train_transmittance" for step in graph_of(glass, "method=2dgs").skipped)
 
 
+def test_mirrors_start_earlier_where_there_is_glass(glass: Path, tmp_path: Path):
+    reflection, transmittance = "method.reflection.start=0.3", "method.transmittance.start=0.6"
+    words = (reflection, "method.reflection.start_before_glass=0.1", transmittance)
+
+    def starts(graph: RunGraph) -> list[int]:
+        return [step.params.from_step for step in graph.training[1:]]
+
+    before = graph_of(glass, *words)
+    assert starts(before) == [1, 7]
+    assert all(step.params.method.reflection.start == 0.1 for step in before.training[1:])
+    said = "reflection from 0.1 of the run on"
+    assert [each.what for each in before.moved] == [said]
+    plain = write_capture(tmp_path / "none", "none")
+    for other in (graph_of(plain, *words), graph_of(glass, *words, "ablation=two_stages")):
+        assert starts(other) == [4]
+        assert other.moved == ()
+    assert starts(graph_of(glass, *words, "method.reflection.start=0.05")) == [1, 7]  # earlier is not held back
+    same = graph_of(glass, "method.reflection.start=0.1", transmittance)
+    assert [step.fingerprint for step in before.training] == [step.fingerprint for step in same.training]
+
+
 OWN_KEYS = """
 from dataclasses import replace
 from rtgs.methods import MethodSpec
