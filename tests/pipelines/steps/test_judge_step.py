@@ -100,7 +100,7 @@ def test_the_judge_measures_what_neither_method_was_trained_on(glass):
         plain = plain_image(places, scene, view.camera)
         gains.append(psnr(full, view.image, mask=inside) - psnr(plain, view.image, mask=inside))
     assert record.regions[1].gain == pytest.approx(sum(gains) / len(gains))
-    assert record.regions[1].gain < 0
+    assert sum(gains) < 0
 
 
 def test_a_judged_run_says_what_it_shows(glass, capsys, monkeypatch):
@@ -153,6 +153,20 @@ def test_a_scene_too_small_to_spare_views_keeps_the_full_method(capture, root, c
     told = capsys.readouterr()
     for text in (told.err, told.out):  # the log of the step, and the end of the run
         assert "kept 2dgs in the picture: 0 held-out views show it, 2 are needed: nobody can judge" in text
+
+
+def test_a_sweep_merges_judged_jobs_and_the_plain_method_is_not_judged(capture, root, capsys):
+    """The plain method's numbers are composed within the sweep, by whoever needs them: the launcher and each job."""
+    words = [f"scene={capture}", *QUICK, "method=2dgs,3dgs", "judge=photos", "schedule.total=8"]
+    launcher = ["hydra/launcher=rtgs_dask", "hydra.launcher.workers=1", "hydra.launcher.threads=1"]
+    assert main(["run", "--multirun", *words, *launcher]) == 0
+    told = capsys.readouterr()
+    assert "2 jobs, 12 steps, 0 from the cache" in told.err
+    assert "no judge step: 3dgs is the plain method itself" in told.err
+    assert JudgeRecord.read(root / "runs" / "tiny_room-2dgs-smoke-judged").full == "2dgs"
+    assert not (root / "runs" / "tiny_room-3dgs-smoke" / "judge.json").exists()
+    assert main(["plan", "--multirun", *words]) == 0
+    assert "12 steps, 12 from the cache, nothing to do" in capsys.readouterr().out
 
 
 def test_runs_without_a_judge_render_as_ever(tmp_path):
