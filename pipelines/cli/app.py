@@ -142,10 +142,12 @@ def tracked_place(config: RunConfig, tracking: Tracking) -> str:
 
 
 def _show(results: Sequence[StepResult], folder: Path) -> None:
-    from pipelines.publishing.results import evaluation_of, result_table
+    from pipelines.publishing.results import evaluation_of, judge_record, result_table
     from pipelines.steps.report import PAGE
 
-    print(f"\n{result_table([evaluation_of(results)])}\n\nreport: {short(folder / PAGE)}")
+    record = judge_record(results)
+    judged = "".join(f"\n{decision}" for decision in record.decisions()) if record is not None else ""
+    print(f"\n{result_table([evaluation_of(results)])}\n{judged}\nreport: {short(folder / PAGE)}")
 
 
 def short(path: Path) -> str:

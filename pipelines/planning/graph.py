@@ -1,4 +1,4 @@
-"""The graph of a run: (sfm, masks, normals ->) import -> one step per stage (+ mesh) -> render, evaluate, report.
+"""The graph of a run: (sfm, masks, normals ->) import -> a step per stage (+ mesh, judge) -> render, evaluate, report.
 
 Pure: from a config to steps with parameters; nothing runs here. Each step is given only what it reads.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, replace
 
 from pipelines.planning.inspection import Inspections
+from pipelines.planning.judge import hold_out_views, judge_steps, why_unjudged
 from pipelines.planning.mask_plan import draws_panes
 from pipelines.planning.preparation import Preparation, prepare
 from pipelines.planning.transparent import Transparency, find_transparency
@@ -15,6 +16,7 @@ from pipelines.steps import (
     evaluate,
     extract_mesh,
     import_scene,
+    judge,
     masks,
     normals,
     render,
@@ -24,11 +26,13 @@ from pipelines.steps import (
     train,
 )
 from pipelines.steps.training import StageParams
+from rtgs.config.convert import judged
 from rtgs.config.schema import Choices, RunConfig
 from rtgs.core.decisions import Decision
 from rtgs.methods import find_method
 from rtgs.methods.settings import MethodSettings
 from rtgs.pretrained.keys import ABSENT
+from rtgs.train.networks import Named
 from rtgs.train.settings import ScheduleSettings
 from rtgs.workflow import Step, StepKind
 from rtgs.workflow.fingerprint import flatten
@@ -40,6 +44,7 @@ KINDS: tuple[StepKind, ...] = (
     import_scene.STEP,
     *train.training_kinds(),
     extract_mesh.STEP,
+    judge.STEP,
     render.STEP,
     evaluate.STEP,
     report.STEP,
@@ -60,6 +65,7 @@ class RunGraph:
     evaluate: Step
     report: Step
     mesh: Step | None = None
+    judge: tuple[Step, ...] = ()  # the plain method's training, and the judge
     skipped: tuple[Decision, ...] = ()  # ``what`` is the name of the step
     unread: tuple[Decision, ...] = ()  # what the settings ask for and no step does
     moved: tuple[Decision, ...] = ()  # what begins at another time than in other scenes
@@ -85,17 +91,20 @@ def build_graph(config: RunConfig, choices: Choices, inspections: Inspections | 
     prepared = prepare(config, inspection)
     scene = prepared.scene
     transparency = find_transparency(config, inspection, prepared)
-    training, object_mesh = _training(config, prepared, transparency.present)
-    rendered = render.STEP.step(render.RenderParams(), scene, *training)
+    networks = tuple(found for found in _pretrained() if found[1] != ABSENT)  # without them the key stays as it was
+    training, object_mesh = _training(config, prepared, transparency.present, networks)
+    judging = judge_steps(config, choices, prepared, training, networks)
+    rendered = render.STEP.step(render.RenderParams(), scene, *training, *judging)
     measured = evaluate.STEP.step(
-        evaluate.EvaluateParams(config.evaluation, method_label(choices), choices.preset),
+        evaluate.EvaluateParams(config.evaluation, _label(config, choices), choices.preset),
         scene,
         *training,
         *(() if object_mesh is None else (object_mesh,)),
+        *judging,
         rendered,
         tools=_pretrained() if config.evaluation.lpips else (),
     )
-    skipped = (*prepared.skipped, *_left_out(config, transparency, object_mesh))
+    skipped = (*prepared.skipped, *_left_out(config, transparency, object_mesh), *why_unjudged(config))
     mesh = object_mesh
     if mesh is None and config.mesh.extract:
         mesh = extract_mesh.STEP.step(_mesh_params(config), scene, *training)
@@ -103,12 +112,13 @@ def build_graph(config: RunConfig, choices: Choices, inspections: Inspections | 
     unread = find_method(config.method.name).unread_losses(config.method)
     moved = _moved_starts(config, transparency.present)
     params = _report_params(config, choices, skipped, (*unread, *moved))
-    page = report.STEP.step(params, *prepared.steps, scene, *training, *made)
-    return RunGraph(scene, training, rendered, measured, page, mesh, skipped, unread, moved)
+    page = report.STEP.step(params, *prepared.steps, scene, *training, *judging, *made)
+    return RunGraph(scene, training, rendered, measured, page, mesh, judging, skipped, unread, moved)
 
 
 def _as_asked(config: RunConfig) -> RunConfig:
-    """``masks=none``: not those that the capture brings either."""
+    """``masks=none``: not those that the capture brings either. A judge has views held out."""
+    config = hold_out_views(config)
     if config.masks.source != "none":
         return config
     return replace(config, scene=replace(config.scene, masks_dir=""))
@@ -128,7 +138,9 @@ def _left_out(config: RunConfig, transparency: Transparency, object_mesh: Step |
     return ()
 
 
-def _training(config: RunConfig, prepared: Preparation, transparent: bool) -> tuple[tuple[Step, ...], Step | None]:
+def _training(
+    config: RunConfig, prepared: Preparation, transparent: bool, networks: Named
+) -> tuple[tuple[Step, ...], Step | None]:
     """One training step per stage, and the object mesh that a third one builds on."""
     scene = prepared.scene
     method: MethodSettings = replace(config.method, paper_schedule=ScheduleSettings())  # a preset has read it by now
@@ -136,7 +148,6 @@ def _training(config: RunConfig, prepared: Preparation, transparent: bool) -> tu
     object_mesh = None
     spec = find_method(method.name)
     method = method.in_scene(glass=_through_glass(config, transparent))
-    networks = tuple(found for found in _pretrained() if found[1] != ABSENT)  # without them the key stays as it was
     for stage in spec.timeline(method, config.schedule, transparent=transparent):
         own = spec.stage(stage.name)
         read = own.reads(method)  # so that runs that differ elsewhere share the stage
@@ -188,12 +199,17 @@ def method_label(choices: Choices) -> str:
     return choices.method if choices.ablation in ("", "none") else f"{choices.method}, {choices.ablation}"
 
 
+def _label(config: RunConfig, choices: Choices) -> str:
+    """With what a judge does to it: such rows are not the pure method's."""
+    return f"{method_label(choices)}, judged" if judged(config) else method_label(choices)
+
+
 def _report_params(
     config: RunConfig, choices: Choices, skipped: tuple[Decision, ...], noted: tuple[Decision, ...]
 ) -> report.ReportParams:
     values, defaults = shown_values(config), shown_values(RunConfig())
     lines = {key: (str(values[key]), str(defaults.get(key, ""))) for key in sorted(values)}
-    title = f"{config.scene.name}: {method_label(choices)}, {choices.preset}"
+    title = f"{config.scene.name}: {_label(config, choices)}, {choices.preset}"
     decisions = [(f"no {step.what} step", step.why) for step in skipped]
     decisions += [(each.what, each.why) for each in noted]
     return report.ReportParams(title, command(choices), lines, tuple(decisions))
@@ -203,6 +219,8 @@ def shown_values(config: RunConfig) -> dict[str, object]:
     """Every value that has to do with the result, by dotted key."""
     meshed = config.mesh.extract or find_method(config.method.name).object_stage(config.method) is not None
     hidden = _NOT_SHOWN if meshed else (*_NOT_SHOWN, "mesh.")
+    if not config.judge.plain and not config.scene.hold_out:  # pages of runs without a judge stay as they were
+        hidden = (*hidden, "judge.", "scene.hold_out")
     return {key: value for key, value in flatten(asdict(config)).items() if not key.startswith(hidden)}
 
 

@@ -16,6 +16,8 @@ from filelock import FileLock
 from pipelines.planning.rows import plan_rows
 from pipelines.publishing.run_record import RUN_FILE, RunRecord
 from pipelines.steps.evaluate import TABLE_CSV, TABLE_JSON
+from pipelines.steps.judge import PLAIN
+from pipelines.steps.judge import STEP as JUDGE
 from pipelines.steps.pictures import final_pictures, training_pictures
 from pipelines.steps.report import PAGE
 from pipelines.steps.report import STEP as REPORT
@@ -23,6 +25,7 @@ from pipelines.steps.training import read_history, stage_params
 from rtgs.config.schema import Choices, RunConfig
 from rtgs.core.errors import RtgsError
 from rtgs.core.listing import columns
+from rtgs.evaluate.judgement import RECORD_FILE, JudgeRecord
 from rtgs.evaluate.records import EvaluationTable, read_json
 from rtgs.prepare.masks.report import FILES as MASK_FILES
 from rtgs.prepare.poses.quality import PICTURE_FILE, REPORT_FILE
@@ -58,7 +61,8 @@ def write_run_folder(config: RunConfig, choices: Choices, command: str, results:
     """Copy what people look at into ``runs/<name>``; nothing is copied when it is all there already.
 
     ``report.html``, ``metrics.json``, ``metrics.csv``, ``renders/``, ``errors/``, ``point_cloud.ply`` (the base set;
-    other sets under their own names), ``mesh.ply`` when asked for, ``config.yaml``, ``run.json``.
+    other sets under their own names; the plain method's where a judge kept it everywhere), ``mesh.ply`` when asked for,
+    ``judge.json`` of a run with a judge, ``config.yaml``, ``run.json``.
     """
     folder = config.paths.runs / str(config.name)
     config.paths.runs.mkdir(parents=True, exist_ok=True)
@@ -87,15 +91,18 @@ def _fill_run_folder(
         return folder
     folder.mkdir(parents=True, exist_ok=True)
     (folder / RUN_FILE).unlink(missing_ok=True)  # written last: a folder without it is incomplete
-    for left in (*folder.glob("*.ply"), *folder.glob("mesh.*")):  # of another run of this name, with other stages
-        left.unlink(missing_ok=True)
+    for pattern in ("*.ply", "mesh.*", RECORD_FILE):  # of another run of this name, with other stages
+        for left in folder.glob(pattern):
+            left.unlink(missing_ok=True)
     places = folders(results)
     shutil.copyfile(places["report"] / PAGE, folder / PAGE)
     for name in (TABLE_JSON, TABLE_CSV):
         shutil.copyfile(places["evaluate"] / name, folder / name)
     _replace_tree(places["render"] / "images", folder / "renders")
     _replace_tree(places["evaluate"] / "errors", folder / "errors")
-    for ply in sorted(final_training(results).glob("*.ply")):
+    if JUDGE.name in places:
+        shutil.copyfile(places[JUDGE.name] / RECORD_FILE, folder / RECORD_FILE)
+    for ply in sorted(shown_training(results).glob("*.ply")):
         shutil.copyfile(ply, folder / ("point_cloud.ply" if ply.stem == "base" else ply.name))
     for mesh in sorted(places["extract_mesh"].glob("mesh.*")) if "extract_mesh" in places else ():
         shutil.copyfile(mesh, folder / mesh.name)
@@ -134,6 +141,18 @@ def final_training(results: Sequence[StepResult]) -> Path:
     """The artifact of the last training stage."""
     trained = [result.folder for result in results if result.step.name.startswith("train_")]
     return max(trained, key=lambda folder: stage_params(folder).until)
+
+
+def judge_record(results: Sequence[StepResult]) -> JudgeRecord | None:
+    """What the judge of a run decided; None: it has none."""
+    places = folders(results)
+    return JudgeRecord.read(places[JUDGE.name]) if JUDGE.name in places else None
+
+
+def shown_training(results: Sequence[StepResult]) -> Path:
+    """The artifact whose sets of Gaussians are published: of the run's method, unless nothing of it is shown."""
+    record = judge_record(results)
+    return folders(results)[PLAIN] if record is not None and record.all_plain else final_training(results)
 
 
 def config_yaml(config: RunConfig) -> str:

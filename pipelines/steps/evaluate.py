@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipelines.steps.judge import PLAIN
+from pipelines.steps.judge import STEP as JUDGE
 from pipelines.steps.render import RenderTimes, read_timed
 from pipelines.steps.training import last_training, read_summary
+from rtgs.evaluate.judgement import JudgeRecord
 from rtgs.evaluate.networks import check_networks
 from rtgs.evaluate.settings import EvaluationSettings
 from rtgs.mesh.record import MeshRecord
@@ -19,6 +23,7 @@ from rtgs.workflow import StepContext, StepKind
 if TYPE_CHECKING:
     from rtgs.evaluate.records import ObjectFacts
     from rtgs.scenes.scene import Scene
+    from rtgs.train.trainer import TrainSummary
 
 TABLE_JSON = "metrics.json"
 TABLE_CSV = "metrics.csv"
@@ -55,7 +60,7 @@ def evaluate(params: EvaluateParams, context: StepContext) -> None:
     scene = context.read("import_scene", read_scene)
     if not scene.test:
         context.log.warning("nothing is measured: %s", NO_TEST_VIEWS)
-    summary = read_summary(last_training(context.inputs))
+    summary = _summary(context.inputs)
     facts = RunFacts(
         scene=scene.name,
         method=params.method,
@@ -82,6 +87,21 @@ def evaluate(params: EvaluateParams, context: StepContext) -> None:
     if known is not None:
         context.log.info("guide of the object's mesh: %s", known.fallbacks)
         context.tracker.metrics({f"object/{name}": value for name, value in known.numbers().items()})
+
+
+def _summary(inputs: Mapping[str, Path]) -> TrainSummary:
+    """Of the training; where a judge was asked, with what the plain method cost, and the surfels of what is shown."""
+    full = read_summary(last_training(inputs))
+    if JUDGE.name not in inputs:
+        return full
+    plain, record = read_summary(inputs[PLAIN]), JudgeRecord.read(inputs[JUDGE.name])
+    return replace(
+        full,
+        seconds=full.seconds + plain.seconds,
+        cpu_seconds=full.cpu_seconds + plain.cpu_seconds,
+        peak_memory_mb=max(full.peak_memory_mb, plain.peak_memory_mb),
+        surfels=(0 if record.all_plain else full.surfels) + (plain.surfels if record.replaced else 0),
+    )
 
 
 def object_facts(folder: Path, scene: Scene) -> ObjectFacts | None:

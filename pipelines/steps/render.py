@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipelines.steps.judge import read_mixture
 from pipelines.steps.training import last_training, load_method
 from pipelines.steps.views import COVERAGE, read_coverage, read_render, view_maps
 from rtgs.core.errors import RtgsError
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
 
 TIMES_FILE = "render.json"
 GIVEN = "image_given_masks"  # of methods with a third stage: seen through the view's own mask, not the silhouette
+
+FULL = "image_full"  # where the judge kept the plain method: of the full method alone
 
 
 @dataclass(frozen=True)
@@ -78,7 +81,8 @@ def render(params: RenderParams, context: StepContext) -> None:
 
     Writes ``images/<stem>.png`` (8 bit), ``views/<stem>.safetensors`` (float32: image (3, H, W) not clamped, depth
     (H, W) z-depth divided by alpha in world units, normal (3, H, W) world frame where the method has one, alpha (H, W);
-    with a third stage also ``image_given_masks``), ``coverage.safetensors`` (by view name (H, W) int16: training views
+    with a third stage also ``image_given_masks``; where a judge kept the plain method ``image_full``, the full one's
+    image: maps and layers are the full method's), ``coverage.safetensors`` (by view name (H, W) int16: training views
     that show what the pixel shows) and ``render.json`` (:class:`RenderTimes`).
     """
     import torch
@@ -90,6 +94,7 @@ def render(params: RenderParams, context: StepContext) -> None:
 
     scene = context.read("import_scene", read_scene)
     method, stage = load_method(last_training(context.inputs), scene)
+    mixture = read_mixture(context.inputs, scene)
     options = RenderOptions()
     if params.maps:  # they change no bit of the image
         options = RenderOptions(depth=True, normal="normal" in method.maps, layers=True)
@@ -101,18 +106,20 @@ def render(params: RenderParams, context: StepContext) -> None:
         with torch.no_grad():
             start = time.perf_counter()
             rendered = method.render(view.camera, stage.until, Mode.EVALUATE, options, view.mask)
+            image = rendered.image if mixture is None else mixture.of(view.camera, rendered.image)
             seconds[view.name] = time.perf_counter() - start
-            tensors = {"image": rendered.image.contiguous()}
+            tensors = {"image": image.contiguous()}
+            if mixture is not None:
+                tensors[FULL] = rendered.image.contiguous()
             if params.maps:
                 tensors |= view_maps(rendered)
                 surfaces[view.name] = _first_surface(view, tensors)
             if "transparent" in rendered.maps and view.mask is not None:
                 given = RenderOptions(masks="given")
-                tensors[GIVEN] = method.render(
-                    view.camera, stage.until, Mode.EVALUATE, given, view.mask
-                ).image.contiguous()
+                seen = method.render(view.camera, stage.until, Mode.EVALUATE, given, view.mask).image
+                tensors[GIVEN] = (seen if mixture is None else mixture.of(view.camera, seen)).contiguous()
         save_file(tensors, context.out / "views" / f"{stem}.safetensors")
-        write_png(context.out / "images" / f"{stem}.png", to_bytes(rendered.image))
+        write_png(context.out / "images" / f"{stem}.png", to_bytes(image))
     if surfaces:
         save_file(_coverage(method, scene, stage.until, surfaces), context.out / COVERAGE)
     RenderTimes(seconds, params.maps).write(context.out)

@@ -10,11 +10,13 @@ from typing import TYPE_CHECKING
 
 from pipelines.steps import extract_mesh
 from pipelines.steps.evaluate import TABLE_JSON
+from pipelines.steps.judge import STEP as JUDGE
 from pipelines.steps.render import RenderTimes
 from pipelines.steps.training import last_training, read_history, read_summary
 from pipelines.steps.views import read_coverage, read_render
 from rtgs.core.decisions import Decision
 from rtgs.core.records import damaged
+from rtgs.evaluate.judgement import JudgeRecord
 from rtgs.mesh.record import RECORD_FILE, MeshRecord
 from rtgs.workflow import StepContext, StepKind
 from rtgs.workflow.manifest import Manifest
@@ -62,6 +64,7 @@ def report(params: ReportParams, context: StepContext) -> None:
     decisions += () if mesh is None else mesh.decisions  # how the transparent object's mesh was chosen
     decisions += _boundary(training)
     decisions += _guide(table)
+    decisions += JudgeRecord.read(inputs[JUDGE.name]).decisions() if JUDGE.name in inputs else ()
     data = ReportData(
         title=params.title,
         evaluation=table,

@@ -80,17 +80,19 @@ def kind_of(stage: StageSpec) -> StepKind:
     return StepKind(f"train_{stage.name}", stage.version, train)
 
 
-def train_step(spec: MethodSpec, params: StageParams, *upstream: Step, networks: Named = ()) -> Step:
+def train_step(
+    spec: MethodSpec, params: StageParams, *upstream: Step, networks: Named = (), name: str | None = None
+) -> Step:
     """The step of one stage of a method.
 
     ``networks``: (name, digest) of the pretrained files that are on this machine; those that the perceptual loss reads
     belong to the recipe. So does the source of a method from outside: no review of this project asks for a new version
-    when it changes.
+    when it changes. ``name``: of the step, where it is not that of the stage.
     """
     tools = named_in_key(params.method.loss, networks)
     if not is_own(spec):
         tools = (*tools, (f"method {spec.name}", _source_digest(spec)))
-    return kind_of(spec.stage(params.stage)).step(params, *upstream, tools=tools)
+    return kind_of(spec.stage(params.stage)).step(params, *upstream, name=name, tools=tools)
 
 
 def _source_digest(spec: MethodSpec) -> str:

@@ -6,9 +6,12 @@ from collections.abc import Mapping, Sequence
 
 from omegaconf import DictConfig
 
-from rtgs.config.convert import to_run_config
+from rtgs.config.convert import to_run_config, with_own
 from rtgs.config.locate import conf_dir
 from rtgs.config.schema import Choices, RunConfig, register_schema
+from rtgs.core.build import build
+from rtgs.methods.settings import MethodSettings
+from rtgs.train.settings import ScheduleSettings
 
 VERSION_BASE = "1.3"
 
@@ -31,6 +34,34 @@ def compose(overrides: Sequence[str]) -> tuple[RunConfig, Choices]:
     return to_run_config(without_hydra(composed), choices)
 
 
+def compose_plain(method: str, choices: Choices) -> tuple[MethodSettings, ScheduleSettings]:
+    """Another method's own numbers at the preset of a run, and the schedule they give; of what the run sets by word,
+    keys of ``schedule`` hold for it as well.
+
+    Raises:
+        hydra.errors.HydraException: no such method or preset.
+    """
+    from hydra import compose as hydra_compose
+    from hydra import initialize_config_dir
+    from hydra.core.global_hydra import GlobalHydra
+    from omegaconf import OmegaConf
+
+    chosen = {"scene": choices.scene_file, "preset": choices.preset}
+    words = [f"method={method}", *(f"{group}={name}" for group, name in chosen.items() if name)]
+    words += [word for word in choices.overrides if word.lstrip("+~").startswith("schedule.")]
+    register_schema()
+    if GlobalHydra.instance().is_initialized():  # in a job: it knows the folders that the command line adds
+        composed = hydra_compose("config", overrides=words)
+    else:
+        with initialize_config_dir(str(conf_dir()), version_base=VERSION_BASE):
+            composed = hydra_compose("config", overrides=words)
+    found, schedule = (OmegaConf.to_container(composed[group], resolve=True) for group in ("method", "schedule"))
+    assert isinstance(found, dict)
+    assert isinstance(schedule, dict)
+    own = with_own(build(MethodSettings, {str(key): value for key, value in found.items()}))
+    return own, build(ScheduleSettings, {str(key): value for key, value in schedule.items()})
+
+
 def without_hydra(composed: DictConfig) -> DictConfig:
     """The part of a composed config that is ours."""
     from omegaconf import OmegaConf, open_dict
@@ -46,6 +77,6 @@ def choices_from(groups: Mapping[str, object], overrides: Sequence[str]) -> Choi
     """Hydra's record of chosen files and overrides as :class:`Choices`."""
     names = {str(key): str(value) for key, value in groups.items() if value is not None}
     chosen = {key: names.get(key, "") for key in ("method", "preset", "ablation", "experiment")}
-    told_otherwise = {*names, "hydra", "paths.root", "name", "threads"} - {"sfm", "masks", "normals"}
+    told_otherwise = {*names, "hydra", "paths.root", "name", "threads"} - {"sfm", "masks", "normals", "judge"}
     keys = [item for item in overrides if item.split("=", 1)[0].lstrip("+~") not in told_otherwise]
     return Choices(**chosen, scene_file=names.get("scene", ""), overrides=tuple(keys))

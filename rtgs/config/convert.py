@@ -34,7 +34,7 @@ def to_run_config(composed: DictConfig, choices: Choices) -> tuple[RunConfig, Ch
     assert isinstance(values, dict)
     config = build(RunConfig, {str(key): value for key, value in values.items()})
     _refuse_idle_ablation(config, choices)
-    config = replace(config, method=_with_own(config.method))
+    config = replace(config, method=with_own(config.method))
     scene = config.scene
     if config.table.data == "paper" and scene.path.startswith("embedded:"):
         raise RtgsError(
@@ -51,13 +51,13 @@ def to_run_config(composed: DictConfig, choices: Choices) -> tuple[RunConfig, Ch
         scene = replace(scene, name=derive_name(scene.path))
     choices = replace(choices, scene=scene.name)
     config = replace(config, scene=scene, paths=replace(config.paths, root=_absolute(config.paths.root)))
-    name = config.name or run_name(choices, config.seed)
+    name = config.name or run_name(choices, config.seed, judged=judged(config))
     if name != Path(name).name or name == "..":
         raise RtgsError(f"config: name={name!r} is to be one folder in runs/: give a name without / that is not ..")
     return replace(config, name=name), choices
 
 
-def _with_own(method: MethodSettings) -> MethodSettings:
+def with_own(method: MethodSettings) -> MethodSettings:
     """The settings with those of ``method.own`` that differ from their defaults, in one spelling: 1 and 1.0 are one
     recipe.
 
@@ -99,7 +99,12 @@ def derive_name(path: str) -> str:
     return re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_") or "scene"
 
 
-def run_name(choices: Choices, seed: int) -> str:
+def judged(config: RunConfig) -> bool:
+    """Whether a plain method is compared with the run's own."""
+    return config.judge.plain not in ("", config.method.name)
+
+
+def run_name(choices: Choices, seed: int, *, judged: bool = False) -> str:
     """Folder name of a run: ``fox-2dgs-quick``, with the ablation and the seed where they are not the default.
 
     Scenes of a dataset are called with it (``ref_real_sedan``): a stand-in may have the same name.
@@ -108,6 +113,8 @@ def run_name(choices: Choices, seed: int) -> str:
     parts = [choices.scene_file if of_dataset else choices.scene, choices.method, choices.preset]
     if choices.ablation not in ("", "none"):
         parts.append(choices.ablation)
+    if judged:
+        parts.append("judged")
     if seed:
         parts.append(f"seed{seed}")
     return "-".join(part.replace("/", "_") for part in parts if part)

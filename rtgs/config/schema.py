@@ -10,7 +10,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
-from rtgs.core.refuse import refuse_unknown_words, words_of
+from rtgs.core.refuse import refuse_below, refuse_unknown_words, words_of
 from rtgs.evaluate.publish import OWN_DATA, DataKind
 from rtgs.evaluate.settings import EvaluationSettings
 from rtgs.mesh.settings import MeshSource, ObjectSettings, TsdfSettings
@@ -102,6 +102,19 @@ class MeshConfig:
 
 
 @dataclass(frozen=True)
+class JudgeConfig:
+    """The judge on photos: where the method does not beat a plain one on held-out views, the plain one is shown."""
+
+    plain: str = ""
+    """The plain method, a file of ``conf/method``: it is trained as well, on the same views. Empty: no judge."""
+    every: int = 12
+    """About every n-th training view is held out for it (``scene.hold_out``, which goes first where it is not 0)."""
+
+    def __post_init__(self) -> None:
+        refuse_below("judge.every", self.every, 1)
+
+
+@dataclass(frozen=True)
 class TableConfig:
     """The table that a sweep ends with (:mod:`rtgs.evaluate.publish`); set by files of ``conf/experiment``."""
 
@@ -145,6 +158,7 @@ class RunConfig:
     evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
     mesh: MeshConfig = field(default_factory=MeshConfig)
     ablation: AblationConfig = field(default_factory=AblationConfig)
+    judge: JudgeConfig = field(default_factory=JudgeConfig)
     table: TableConfig = field(default_factory=TableConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     paths: PathsConfig = field(default_factory=PathsConfig)

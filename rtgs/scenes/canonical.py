@@ -45,6 +45,9 @@ def save_scene(scene: Scene, folder: Path) -> None:
     (folder / "views").mkdir(parents=True, exist_ok=True)
     entries = {"train": [], "test": []}
     views = [("train", view) for view in scene.train] + [("test", view) for view in scene.test]
+    if scene.held:  # scenes without such views are stored as they always were
+        entries["held"] = []
+        views += [("held", view) for view in scene.held]
     for index, (part, view) in enumerate(views):
         file = f"views/{index:05d}.safetensors"
         tensors = {"image": view.image, "mask": view.mask, "normal": view.normal}
@@ -88,6 +91,7 @@ def read_scene(folder: Path) -> Scene:
             point_colors=cloud["point_colors"],
             extent=content["extent"],
             source=content["source"],
+            held=tuple(_view(folder, _ViewEntry(**entry)) for entry in content.get("held", ())),
         )
     except (OSError, json.JSONDecodeError, SafetensorError, KeyError, TypeError) as error:
         raise CaptureError(

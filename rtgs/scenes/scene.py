@@ -26,7 +26,7 @@ from rtgs.scenes.images import (
 from rtgs.scenes.importers.registry import read_capture
 from rtgs.scenes.points import camera_extent, filter_points, random_points, too_few_points
 from rtgs.scenes.settings import CaptureError, SceneSettings
-from rtgs.scenes.splits import choose_split, select_views
+from rtgs.scenes.splits import choose_split, hold_out, select_views
 from rtgs.scenes.synthetic.record import CaptureRecord
 from rtgs.scenes.truth import ViewTruth, read_truth
 from rtgs.scenes.undistort import Lens, undistort_image, undistort_nearest
@@ -57,6 +57,7 @@ class Scene:
     point_colors: Tensor  # (P, 3) float32 in 0..1
     extent: float  # 1.1 x largest distance of the training cameras to their mean, world units
     source: str  # where it came from: format, split rule, origin of the points
+    held: tuple[View, ...] = ()  # kept from training and testing alike: methods are compared on them
 
     @property
     def has_masks(self) -> bool:
@@ -82,6 +83,7 @@ class Scene:
             masks=sum(view.mask is not None for view in views),
             normals=sum(view.normal is not None for view in views),
             source=self.source,
+            held_views=len(self.held),
         )
 
 
@@ -98,12 +100,14 @@ class SceneSummary:
     masks: int  # views with a mask
     normals: int  # views with a normal map
     source: str
+    held_views: int = 0
 
     def __str__(self) -> str:
         sizes = ", ".join(f"{width}x{height}" for width, height in self.sizes[:3])
         sizes += f" and {len(self.sizes) - 3} more sizes" if len(self.sizes) > 3 else ""
+        held = f"{self.held_views} more held out, " if self.held_views else ""
         return (
-            f"{self.name}: {self.train_views} training and {self.test_views} test views of {sizes}, "
+            f"{self.name}: {self.train_views} training and {self.test_views} test views of {sizes}, {held}"
             f"{self.points} points, extent {self.extent:.4g}, {self.masks} masks, {self.normals} normal maps "
             f"({self.source})"
         )
@@ -134,10 +138,11 @@ def load_scene(settings: SceneSettings) -> Scene:
     for finding in findings:
         log.log(logging.WARNING if finding.severity == "warning" else logging.INFO, "%s", finding.message)
     views = select_views(capture, settings)
-    split = choose_split(capture, [view.name for view in views], settings)
+    split = hold_out(choose_split(capture, [view.name for view in views], settings), settings.hold_out)
     by_name = {view.name: view for view in views}
-    extent = camera_extent(np.array([by_name[name].center for name in split.train]).reshape(-1, 3))
-    used = [by_name[name] for name in (*split.train, *split.test)]
+    inner = (*split.train, *split.held)  # extent and points are those of a run that holds out nothing
+    extent = camera_extent(np.array([by_name[name].center for name in sorted(inner)]).reshape(-1, 3))
+    used = [by_name[name] for name in (*sorted(inner), *split.test)]
     points, point_source = _scene_points(capture, settings, used, extent)
     record = CaptureRecord.read(capture.root)
     scene = Scene(
@@ -147,6 +152,7 @@ def load_scene(settings: SceneSettings) -> Scene:
         points=torch.from_numpy(points.positions.astype(np.float32)),
         point_colors=torch.from_numpy(points.colors.astype(np.float32)),
         extent=extent,
+        held=tuple(load_view(by_name[name], settings) for name in split.held),
         source=f"{capture.format}; test views: {split.rule}; points: {point_source}{record.origin if record else ''}",
     )
     log.info("%s", scene.summary())

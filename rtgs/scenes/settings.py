@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 from rtgs.core.errors import RtgsError
+from rtgs.core.recipe import UNLESS_DEFAULT
 from rtgs.core.refuse import refuse_below, refuse_unknown_words, refuse_unless
 
 CaptureFormat = Literal["auto", "colmap", "transforms", "blender"]
@@ -79,6 +80,9 @@ class SceneSettings:
     mis-triangulated. 0: keep all."""
     seed: int = 0
     """Seed of random points."""
+    hold_out: int = field(default=0, metadata=UNLESS_DEFAULT)
+    """About every n-th training view is neither trained on nor a test view, spread evenly; at least 2, at most 12, and
+    none of fewer than 8. 0: none. The judge compares methods on them (``judge.every``)."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "background", tuple(float(c) for c in self.background))
@@ -89,6 +93,6 @@ class SceneSettings:
         refuse_unless(ratio is None or 0 < ratio <= 1, "scene.resize_ratio", ratio, "in (0, 1]")
         for key, least in (("long_side", 1), ("max_views", 1), ("max_point_error", 0), ("random_box", 0)):
             refuse_below(f"scene.{key}", getattr(self, key), least)
-        for key in ("split_every", "min_points", "min_track_length", "near_camera", "far_factor"):
+        for key in ("split_every", "min_points", "min_track_length", "near_camera", "far_factor", "hold_out"):
             refuse_below(f"scene.{key}", getattr(self, key), 0)
         refuse_below("scene.random_points", self.random_points, 1)

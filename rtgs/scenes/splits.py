@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -19,6 +19,11 @@ class Split:
     train: tuple[str, ...]
     test: tuple[str, ...]
     rule: str  # how it was decided, for the log and the report
+    held: tuple[str, ...] = ()  # neither trained on nor tested on
+
+
+_LEAST_HELD, _MOST_HELD = 2, 12  # one view has no spread; more cost training views and tell little
+_LEAST_TRAIN = 8  # of fewer training views none can be spared
 
 
 def select_views(capture: Capture, settings: SceneSettings) -> list[CaptureView]:
@@ -53,6 +58,20 @@ def every_nth(names: list[str], every: int) -> Split:
     chosen = set(test)
     return Split(
         tuple(n for n in names if n not in chosen), test, f"every {every}th view in name order, from the first"
+    )
+
+
+def hold_out(split: Split, every: int) -> Split:
+    """Take about every n-th of the training views out of them, evenly over name order; 0 = none."""
+    count = len(split.train)
+    if every == 0 or count < _LEAST_TRAIN:
+        return split
+    held = min(max(round(count / every), _LEAST_HELD), _MOST_HELD, count // 2)
+    places = {(2 * k + 1) * count // (2 * held) for k in range(held)}
+    return replace(
+        split,
+        train=tuple(name for place, name in enumerate(split.train) if place not in places),
+        held=tuple(name for place, name in enumerate(split.train) if place in places),
     )
 
 

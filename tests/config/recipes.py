@@ -46,6 +46,9 @@ OVERRIDES = (
     ("rtgs", "masks=none normals=none"),
     ("rtgs", "mesh.source=tsdf mesh.of=scene mesh.object.flat=yes mesh.tsdf.max_blocks=5000"),
     ("rtgs", "mesh.source=hull mesh.object.hull.voxels=64 mesh.object.pane.agree=0.5"),
+    ("rtgs", "judge=photos"),
+    ("rtgs", "judge.plain=2dgs judge.every=6 schedule.total=333 method.density.max_surfels=500"),
+    ("rtgs", "scene.hold_out=5"),
     ("envgs", "method.optics.blend=linear method.optics.weight=split_sum"),
     ("envgs", "method.transmittance.interface.normal_hold=5.0 method.transmittance.first_surface=base"),
     ("envgs", "method.reflection.density.strategy=mcmc method.density.strategy=mcmc"),
@@ -55,6 +58,7 @@ OVERRIDES = (
     ("2dgs", "method.materials.specular=0.2 method.optics.blend=linear method.loss.specular=0.2"),
     ("2dgs", "method.density.max_per_pixel=0.3 method.init.random_points=500 method.render.depth_ratio=1.0"),
     ("3dgs", "method.render.antialiased=true method.render.dilation=0.1 scene.split_every=5"),
+    ("3dgs", "judge=photos"),
     ("3dgs", "method.density.strategy=mcmc method.density.mcmc.growth=0.1"),
 )
 

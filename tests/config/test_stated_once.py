@@ -21,7 +21,7 @@ from rtgs.methods.settings import TransmittanceSettings
 from rtgs.optics.settings import WallSettings
 from rtgs.workflow.fingerprint import flatten
 
-GROUPS = ("scene", "sfm", "masks", "normals", "method", "tracking")  # nothing lies below their files but the schema
+GROUPS = ("scene", "sfm", "masks", "normals", "method", "judge", "tracking")  # below: the schema
 SCHEMA = flatten(asdict(RunConfig()))
 
 

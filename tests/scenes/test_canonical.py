@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -51,6 +52,25 @@ def test_round_trip_is_exact(root, tmp_path):
     assert str(back.summary()) == str(scene.summary())
     assert back.has_masks
     assert back.has_normals
+
+
+def test_held_out_views_are_kept_and_change_nothing_else(root, tmp_path):
+    """Points, extent and the other views are those of a scene that holds out nothing."""
+    settings = SceneSettings(path=str(root), long_side=37)
+    whole, scene = load_scene(settings), load_scene(replace(settings, hold_out=4))
+    save_scene(whole, tmp_path / "whole")
+    save_scene(scene, tmp_path / "artifact")
+    back = read_scene(tmp_path / "artifact")
+    assert [view.name for view in back.held] == [whole.train[index].name for index in (2, 6)]
+    by_name = {view.name: view for view in whole.train}
+    for view in (*back.held, *back.train):
+        assert same(view.image, by_name.pop(view.name).image)
+    assert by_name == {}
+    assert (back.extent, [view.name for view in back.test]) == (whole.extent, [view.name for view in whole.test])
+    assert same(back.points, whole.points)
+    assert "6 training and 2 test views of 37x28, 2 more held out" in str(back.summary())
+    assert "held" not in json.loads((tmp_path / "whole" / "scene.json").read_text())
+    assert read_scene(tmp_path / "whole").held == ()
 
 
 def test_damaged_artifacts_are_refused(root, tmp_path):

@@ -10,7 +10,7 @@ import pytest
 from rtgs.scenes.capture import Capture, CaptureError
 from rtgs.scenes.scene import load_scene
 from rtgs.scenes.settings import SceneSettings
-from rtgs.scenes.splits import choose_split, every_nth, read_split_file
+from rtgs.scenes.splits import Split, choose_split, every_nth, hold_out, read_split_file
 
 from .captures import ColmapCapture
 
@@ -30,6 +30,25 @@ def test_every_eighth_in_name_order_is_test():
     assert not set(split.train) & set(split.test)
     assert every_nth(NAMES, 0).test == ()
     assert every_nth(NAMES, 1).train == ()
+
+
+@pytest.mark.parametrize(
+    ("count", "every", "held"),
+    [
+        (42, 12, [5, 15, 26, 36]),  # four of 42, each in the middle of its quarter
+        (20, 12, [5, 15]),  # never only one
+        (300, 12, list(range(12, 300, 25))),  # never more than twelve
+        (8, 1, [1, 3, 5, 7]),  # half of them stay
+        (7, 12, []),  # none can be spared
+        (42, 0, []),
+    ],
+)
+def test_held_out_views_are_spread_over_the_training_views(count: int, every: int, held: list[int]):
+    names = tuple(f"{index:03d}" for index in range(count))
+    split = hold_out(Split(names, ("test",), "a rule"), every)
+    assert split.held == tuple(names[index] for index in held)
+    assert split.train == tuple(name for name in names if name not in split.held)
+    assert (split.test, split.rule) == (("test",), "a rule")
 
 
 @pytest.mark.parametrize("form", ["{}", "images/{}", "./images/{}", "stem"])

@@ -1,0 +1,103 @@
+"""What a judge on photos adds to the graph of a run, and what it leaves alone."""
+
+from __future__ import annotations
+
+import pytest
+
+from pipelines.planning.graph import RunGraph, build_graph, shown_values
+from rtgs.config import compose
+from rtgs.config.compose import compose_plain
+from rtgs.config.locate import choices_of
+from rtgs.config.schema import Choices
+from rtgs.core.errors import RtgsError
+from rtgs.workflow import topological
+
+GLASS = ("scene=ball_statue", "method=rtgs", "preset=smoke")
+
+
+def graph(*words: str) -> RunGraph:
+    return build_graph(*compose(words))
+
+
+def keys(found: RunGraph) -> dict[str, str]:
+    """Without the report's, which names the words of the command."""
+    return {step.name: step.fingerprint for step in topological(found.targets) if step.name != "report"}
+
+
+def test_the_plain_method_is_trained_on_the_same_scene_and_the_judge_sees_both():
+    found = graph(*GLASS, "judge=photos")
+    plain, judge = found.judge
+    assert found.scene.params.settings.hold_out == 12
+    assert plain.upstream == (found.scene,)
+    assert judge.upstream == (found.scene, *found.training, plain)
+    assert {step.name for step in found.training} == {"train_diffuse", "train_reflection", "train_transmittance"}
+    assert all(found.scene in step.upstream for step in found.training)
+    for reader in (found.render, found.evaluate, found.report):
+        assert {plain, judge} <= set(reader.upstream)
+    assert found.evaluate.params.method == "rtgs, judged"
+    assert (judge.params.full, judge.params.plain) == ("rtgs", "3dgs")
+    assert compose([*GLASS, "judge=photos"])[0].name == "ball_statue-rtgs-smoke-judged"
+
+
+def test_the_plain_method_has_its_own_numbers_at_the_preset_of_the_run():
+    words = ("schedule.total=200", "method.density.max_surfels=123", "judge.every=5", "seed=4")
+    found = graph(*GLASS, "judge=photos", *words)
+    plain, _ = found.judge
+    alone = graph("scene=ball_statue", "method=3dgs", "preset=smoke", "scene.hold_out=5", *words[:1], "seed=4")
+    assert plain.recipe == alone.training[0].recipe  # also what a stage of 3dgs reads
+    assert plain.params.until == 200
+    assert found.scene.fingerprint == alone.scene.fingerprint
+    assert plain.fingerprint != alone.training[0].fingerprint  # its name is another: no step has two of one
+
+
+@pytest.mark.parametrize("preset", choices_of("preset"))
+def test_every_preset_gives_the_plain_method_its_own_schedule(preset: str):
+    own, _ = compose(["method=3dgs", f"preset={preset}"])
+    assert compose_plain("3dgs", Choices(preset=preset, method="rtgs")) == (own.method, own.schedule)
+
+
+def test_without_a_judge_nothing_changes():
+    """Nor with one that is not for the method, nor by the number that it alone reads."""
+    plain = keys(graph(*GLASS))
+    assert keys(graph(*GLASS, "judge=none")) == plain
+    assert keys(graph(*GLASS, "judge.every=3")) == plain
+    judged = keys(graph(*GLASS, "judge=photos"))
+    assert set(judged) - set(plain) == {"plain", "judge"}
+    assert not set(judged.values()) & set(plain.values())
+    words = ("scene=ball_statue", "method=3dgs", "preset=smoke")
+    own = graph(*words, "judge=photos")
+    assert own.judge == ()
+    assert [(step.what, step.why) for step in own.skipped if step.what == "judge"] == [
+        ("judge", "3dgs is the plain method itself (judge.plain)")
+    ]
+    assert keys(own) == keys(graph(*words))
+
+
+def test_the_page_names_the_judge_only_where_there_is_one():
+    judged, alone = (shown_values(compose([*GLASS, f"judge={name}"])[0]) for name in ("photos", "none"))
+    assert {key: judged[key] for key in judged.keys() - alone.keys()} == {
+        "judge.plain": "3dgs",
+        "judge.every": 12,
+        "scene.hold_out": 0,
+    }
+
+
+def test_masks_and_normals_are_shared_with_runs_without_a_judge():
+    """Steps that make them look at all photos in any case."""
+    words = ("scene=ball_statue", "method=rtgs", "preset=smoke", "masks=given")
+    made, judged = keys(graph(*words)), keys(graph(*words, "judge=photos"))
+    assert made["masks"] == judged["masks"]
+    assert made["import_scene"] != judged["import_scene"]
+
+
+@pytest.mark.parametrize("table", ["table1", "table2", "table3", "fig_split_sum", "captures"])
+def test_tables_ask_for_the_pure_methods(table: str):
+    config, _ = compose([f"experiment={table}"])
+    assert config.judge.plain == ""
+
+
+def test_a_plain_method_of_several_stages_is_refused():
+    with pytest.raises(RtgsError, match=r"judge.plain=envgs trains in several stages \(diffuse, reflection\)"):
+        graph(*GLASS, "judge.plain=envgs")
+    with pytest.raises(RtgsError, match=r"judge.every=0 must be at least 1"):
+        graph(*GLASS, "judge.every=0")

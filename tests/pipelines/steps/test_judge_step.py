@@ -1,0 +1,174 @@
+"""A judged run through the command line: what is spoilt in the full method shows the plain one, and the run says so."""
+
+# ruff: noqa: F811 (fixtures of app_cases)
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from pipelines.cli.main import main
+from pipelines.steps import judge
+from pipelines.steps.judge import PLAIN
+from pipelines.steps.training import OBJECT_FOLDER, load_method
+from pipelines.steps.views import read_render
+from rtgs.core.cameras import Camera
+from rtgs.evaluate.images import file_stem, to_bytes
+from rtgs.evaluate.judgement import JudgeRecord
+from rtgs.evaluate.metrics import psnr
+from rtgs.evaluate.regions import Regions
+from rtgs.mesh.container import read_object_mesh
+from rtgs.scenes.canonical import read_scene
+from rtgs.scenes.scene import Scene
+from rtgs.train.method import Mode
+from tests.pipelines.app_cases import QUICK, _in_root, capture, root  # noqa: F401  (fixtures)
+from tests.pipelines.steps.test_transmittance_stage import TINY, write_capture
+
+JUDGED = ("judge=photos", *QUICK)
+SPOILT_GLASS = ("method.transmittance.rate_gain=3000.0", "method.transmittance.wall.index=2.5")
+
+
+def folders(run: Path) -> dict[str, Path]:
+    """The artifact of each step of a run."""
+    steps = json.loads((run / "run.json").read_text())["steps"]
+    return {name: run.parents[1] / "store" / name / key[:2] / key for name, key in steps.items()}
+
+
+def plain_image(places: dict[str, Path], scene: Scene, camera: Camera) -> torch.Tensor:
+    method, stage = load_method(places[PLAIN], scene)
+    with torch.no_grad():
+        return method.render(camera, stage.until, Mode.EVALUATE).image
+
+
+@pytest.fixture(scope="module")
+def glass(tmp_path_factory) -> tuple[Path, list[str]]:
+    """The folder of a run whose third stage is spoilt by an absurd rate, and its words."""
+    place = tmp_path_factory.mktemp("glass")
+    scene = write_capture(place / "glass ball", "ball")
+    words = ["run", f"scene={scene}", "method=rtgs", *JUDGED, *TINY, *SPOILT_GLASS, "name=glass"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(place)
+        patch.setenv("RTGS_ROOT", str(place))
+        assert main(words) == 0
+    return place / "runs" / "glass", words
+
+
+def test_a_spoilt_object_shows_the_plain_method_to_the_bit(glass):
+    run, _ = glass
+    places = folders(run)
+    record = JudgeRecord.read(run)
+    assert (record.full, record.plain) == ("rtgs", "3dgs")
+    assert [each.region for each in record.regions] == ["all else", "the object"]
+    assert 1 in record.replaced
+    scene = read_scene(places["import_scene"])
+    assert record.views == tuple(view.name for view in scene.held)
+    assert len(scene.held) == 2
+    regions = Regions(read_object_mesh(places["train_transmittance"] / OBJECT_FOLDER))
+    for view in scene.test:
+        shown = read_render(places["render"], view.name)
+        plain, full = plain_image(places, scene, view.camera), shown["image_full"]
+        numbers = regions.numbers(view.camera)
+        inside = numbers == 1
+        assert 100 < int(inside.sum()) < inside.numel()
+        assert torch.equal(shown["image"][:, inside], plain[:, inside])
+        assert not torch.equal(full[:, inside], plain[:, inside])
+        other = plain if 0 in record.replaced else full
+        assert torch.equal(shown["image"][:, ~inside], other[:, ~inside])
+        assert psnr(shown["image"], view.image, mask=inside) == psnr(plain, view.image, mask=inside)
+        assert psnr(shown["image"], view.image, mask=inside) > psnr(full, view.image, mask=inside)
+        picture = np.asarray(Image.open(run / "renders" / f"{file_stem(view.name)}.png").convert("RGB"))
+        assert np.array_equal(picture, to_bytes(shown["image"]))
+
+
+def test_the_judge_measures_what_neither_method_was_trained_on(glass):
+    """Its figures are those of the held-out views, rendered with both."""
+    places = folders(glass[0])
+    record = JudgeRecord.read(glass[0])
+    scene = read_scene(places["import_scene"])
+    regions = Regions(read_object_mesh(places["train_transmittance"] / OBJECT_FOLDER))
+    method, stage = load_method(places["train_transmittance"], scene)
+    gains = []
+    for view in scene.held:
+        inside = regions.numbers(view.camera) == 1
+        with torch.no_grad():
+            full = method.render(view.camera, stage.until, Mode.EVALUATE).image
+        plain = plain_image(places, scene, view.camera)
+        gains.append(psnr(full, view.image, mask=inside) - psnr(plain, view.image, mask=inside))
+    assert record.regions[1].gain == pytest.approx(sum(gains) / len(gains))
+    assert sum(gains) < 0
+
+
+def test_a_judged_run_says_what_it_shows(glass, capsys, monkeypatch):
+    run, words = glass
+    monkeypatch.chdir(run.parents[1])
+    monkeypatch.setenv("RTGS_ROOT", str(run.parents[1]))
+    assert main(words) == 0  # all of it cached
+    told = capsys.readouterr()
+    assert "nothing to do" in told.err
+    assert "rtgs, judged" in told.out
+    assert "kept the plain 3dgs in the object: error " in told.out
+    page = (run / "report.html").read_text()
+    assert "kept the plain 3dgs in the object" in page
+    assert "files of Gaussians" in page
+    table = json.loads((run / "metrics.json").read_text())
+    seconds = [
+        json.loads((folders(run)[name] / "summary.json").read_text())["seconds"]
+        for name in ("train_transmittance", PLAIN)
+    ]
+    assert table["facts"]["train_seconds"] == pytest.approx(sum(seconds))
+
+
+def test_a_method_that_loses_everywhere_is_not_shown_at_all(capture, root):
+    """A scene without glass: the whole picture is the region. An absurd rate of colours spoils the full method."""
+    common = [f"scene={capture}", *QUICK]
+    spoilt = "method.optimizer.sh_dc=5.0"
+    assert main(["run", *common, "method=rtgs", "judge=photos", spoilt, "method.loss.perceptual=0", "name=lost"]) == 0
+    assert main(["run", *common, "method=3dgs", "scene.hold_out=12", "name=plain"]) == 0
+    lost, plain = root / "runs" / "lost", root / "runs" / "plain"
+    record = JudgeRecord.read(lost)
+    assert [(each.region, each.kept) for each in record.regions] == [("the picture", "plain")]
+    assert record.all_plain
+    for name in ("point_cloud.ply", *(f"renders/{path.name}" for path in plain.glob("renders/*"))):
+        assert (lost / name).read_bytes() == (plain / name).read_bytes(), name
+    assert sorted(path.name for path in lost.glob("*.ply")) == ["point_cloud.ply"]
+    found, alone = (json.loads((run / "metrics.json").read_text()) for run in (lost, plain))
+    for figure in ("psnr", "ssim"):
+        assert [row["values"][figure] for row in found["views"]] == [row["values"][figure] for row in alone["views"]]
+    assert found["facts"]["surfels"] == alone["facts"]["surfels"]
+    assert main(["run", *common, "method=rtgs", spoilt, "method.loss.perceptual=0", "name=lost"]) == 0
+    assert not (lost / "judge.json").exists()  # another run of this name: nothing is left of it
+    assert (lost / "reflection.ply").is_file()
+
+
+def test_a_scene_too_small_to_spare_views_keeps_the_full_method(capture, root, capsys):
+    words = ["run", f"scene={capture}", *JUDGED, "method=2dgs", "scene.max_views=7", "name=few"]
+    assert main(words) == 0
+    record = JudgeRecord.read(root / "runs" / "few")
+    assert (record.views, record.replaced) == ((), ())
+    told = capsys.readouterr()
+    for text in (told.err, told.out):  # the log of the step, and the end of the run
+        assert "kept 2dgs in the picture: 0 held-out views show it, 2 are needed: nobody can judge" in text
+
+
+def test_a_sweep_merges_judged_jobs_and_the_plain_method_is_not_judged(capture, root, capsys):
+    """The plain method's numbers are composed within the sweep, by whoever needs them: the launcher and each job."""
+    words = [f"scene={capture}", *QUICK, "method=2dgs,3dgs", "judge=photos", "schedule.total=8"]
+    launcher = ["hydra/launcher=rtgs_dask", "hydra.launcher.workers=1", "hydra.launcher.threads=1"]
+    assert main(["run", "--multirun", *words, *launcher]) == 0
+    told = capsys.readouterr()
+    assert "2 jobs, 12 steps, 0 from the cache" in told.err
+    assert "no judge step: 3dgs is the plain method itself" in told.err
+    assert JudgeRecord.read(root / "runs" / "tiny_room-2dgs-smoke-judged").full == "2dgs"
+    assert not (root / "runs" / "tiny_room-3dgs-smoke" / "judge.json").exists()
+    assert main(["plan", "--multirun", *words]) == 0
+    assert "12 steps, 12 from the cache, nothing to do" in capsys.readouterr().out
+
+
+def test_runs_without_a_judge_render_as_ever(tmp_path):
+    scene = Scene("none", (), (), torch.zeros(4, 3), torch.zeros(4, 3), 1.0, "test")
+    assert judge.read_mixture({"train_diffuse": tmp_path}, scene) is None
