@@ -27,6 +27,7 @@ _OUTSIDE = (
     *("paths.", "tracking.", "table.", "evaluation.", "ablation.", "name", "threads", "method.name"),
     *("method.paper_schedule.", "scene.name", "scene.path", "scene.format", "normals.file"),
 )
+_WEIGHT = "its weight is 0"  # how rtgs.train.terms explains a loss that a method does not have
 
 
 def ways_of(config: RunConfig, row: str, results: Sequence[StepResult]) -> tuple[str, ...]:
@@ -34,11 +35,13 @@ def ways_of(config: RunConfig, row: str, results: Sequence[StepResult]) -> tuple
 
     ``row`` of a table: ``method`` or ``method, ablation``; an ablation of the paper is compared with the paper's.
     """
-    left_out = (str(each) for each in read_summary(final_training(results)).decisions)
-    return (*_keys(config, row), *left_out)
+    decisions = read_summary(final_training(results)).decisions
+    told = (str(each) for each in decisions if not each.why.startswith(_WEIGHT))  # a weight is a key of the config
+    return (*keys_of(config, row), *told)
 
 
-def _keys(config: RunConfig, row: str) -> tuple[str, ...]:
+def keys_of(config: RunConfig, row: str) -> tuple[str, ...]:
+    """In words, each key of the config whose value is not the paper's."""
     ours, theirs = _values(config), _values(_printed(config, row))
     return tuple(
         f"{key} is {_shown(value)} instead of {_shown(theirs.get(key))}"
