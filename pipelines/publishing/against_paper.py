@@ -25,7 +25,15 @@ PRINTED = {"rtgs": "rtgs_printed"}  # the method that is another one's paper; th
 # Where results go, what is measured, and where this machine has its files: no part of a method.
 _OUTSIDE = (
     *("paths.", "tracking.", "table.", "evaluation.", "ablation.", "name", "threads", "method.name"),
-    *("method.paper_schedule.", "scene.name", "scene.path", "scene.format", "normals.file"),
+    *(
+        "schedule.checkpoint_every",
+        "schedule.evaluate_every",
+        "method.paper_schedule.",
+        "scene.name",
+        "scene.path",
+        "scene.format",
+        "normals.file",
+    ),
 )
 _WEIGHT = "its weight is 0"  # how rtgs.train.terms explains a loss that a method does not have
 
@@ -71,7 +79,9 @@ def _scene_file(name: str) -> str:
 def _values(config: RunConfig) -> dict[str, object]:
     """What the method reads of the config, by dotted key."""
     values = flatten(asdict(replace(config, method=_read(config.method))))
-    return {key: value for key, value in values.items() if not key.startswith(_OUTSIDE)}
+    adaptive = config.method.density.strategy == "adaptive"
+    outside = (*_OUTSIDE, "method.density.mcmc.") if adaptive else _OUTSIDE
+    return {key: value for key, value in values.items() if not key.startswith(outside)}
 
 
 def _read(settings: MethodSettings) -> MethodSettings:

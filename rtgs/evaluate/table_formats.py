@@ -89,10 +89,12 @@ def notes(table: PaperTable) -> tuple[str, ...]:
 
 
 def _against_paper(table: PaperTable) -> list[str]:
-    """Every way in which the runs differ from what the paper describes: what all have in common, then row by row."""
+    """Every way in which the runs differ from what the paper describes: what all have in common, then row by row; of
+    the rows beside which its figures stand."""
     ways = {
         method: tuple(dict.fromkeys(way for scene in table.scenes for way in _differs(table, method, scene)))
         for method in table.methods
+        if any(cell.paper is not None for cell in table.cells.values() if cell.method == method)
     }
     common = [way for way in next(iter(ways.values())) if all(way in others for others in ways.values())]
     found = []

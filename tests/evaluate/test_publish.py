@@ -206,11 +206,13 @@ def test_every_way_in_which_runs_differ_from_the_paper_stands_under_its_figures(
     runs = [
         dataclasses.replace(run("rtgs_printed", "sedan", 20.0), differs=(short,)),
         dataclasses.replace(run("rtgs", "sedan", 21.0), differs=(short, own)),
+        dataclasses.replace(run("2dgs", "sedan", 21.0), differs=("the paper has no such row",)),
     ]
     text = markdown(build_table(TableSpec("t", "T", "paper"), runs))
     assert f"- All runs differ from the paper: {short}." in text
     assert f"- rtgs also differs from the paper: {own}." in text
     assert "rtgs_printed also" not in text
+    assert "no such row" not in text
     assert short not in markdown(build_table(TableSpec("t", "T", "stand_in"), runs))  # no figures of the paper there
 
 
