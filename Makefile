@@ -1,9 +1,12 @@
 # Every target makes its own environment first: a fresh clone + `make demo` or `make test` is all the set-up there is.
 PYTHON ?= python3
 TORCH ?= torch==2.13.0
+# asked first: on Linux the package index would bring torch for CUDA, gigabytes of it; TORCH_INDEX= asks the latter alone
+TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+READY_DEV := $(VENV)/.ready_dev
 NATIVE := $(shell find rtgs/native -name "*.cpp" -o -name "*.h" -o -name "*.cmake") CMakeLists.txt pyproject.toml
 RUN ?=
 # of the tables: PRESET smoke quick standard paper; SEEDS how many; DATA stand_in ref_real nu_nerf (with DATA_ROOT); WORKERS
@@ -30,13 +33,15 @@ WORKER_WORDS = $(if $(findstring hydra/launcher=,$(RUN)),,hydra.launcher.workers
 TABLE = $(BIN)/rtgs run preset=$(PRESET) $(SEED_LIST) $(WORKER_WORDS) $(DATA_WORDS)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test e2e bench lint format docs dashboard accept-steps contact-sheet clean
+.PHONY: help setup setup-dev demo test e2e bench lint format docs dashboard accept-steps contact-sheet clean
 .PHONY: reproduce-table1 reproduce-table2 reproduce-table3 reproduce-fig-split-sum
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-24s %s\n", $$1, $$2}'
 
-setup: $(READY) ## make .venv with everything, native core built
+setup: $(READY) ## make .venv with what a user needs, native core built
+
+setup-dev: $(READY_DEV) ## the same, and what tests and development need
 
 $(READY): $(NATIVE)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || \
@@ -45,9 +50,16 @@ $(READY): $(NATIVE)
 	  { echo "rtgs builds a native core and found no C++ compiler ('$${CXX:-c++}'). Install one: Debian/Ubuntu 'apt install g++', Fedora 'dnf install gcc-c++', macOS 'xcode-select --install'; or set CXX."; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install -q --upgrade pip
-	$(BIN)/pip install -q "$(TORCH)"
-	$(BIN)/pip install -q -e '.[dev,prepare,synthetic]'
+	$(if $(TORCH_INDEX),$(BIN)/pip install -q --index-url $(TORCH_INDEX) --timeout 5 --retries 0 "$(TORCH)" || \
+	  { echo "$(TORCH_INDEX) gives no $(TORCH): taking what pip finds (on Linux it may be for CUDA)."; $(BIN)/pip install -q "$(TORCH)"; },$(BIN)/pip install -q "$(TORCH)")
+	$(BIN)/pip install -q -e '.[prepare,sweeps]'
 	@touch $(READY)
+	@echo "$(VENV) takes $$(du -sh $(VENV) | cut -f1)B"
+
+$(READY_DEV): $(READY)
+	$(BIN)/pip install -q -e '.[dev,prepare,sweeps,synthetic]'
+	@touch $(READY_DEV)
+	@echo "$(VENV) takes $$(du -sh $(VENV) | cut -f1)B"
 
 demo: setup ## train the embedded glass scene, end with a page of pictures and numbers (about 5 minutes)
 	$(BIN)/rtgs run scene=demo method=rtgs preset=quick $(RUN)
@@ -70,38 +82,38 @@ reproduce-fig-split-sum: setup ## microfacet weight against split-sum shading
 	$(call of_data,ref_real)$(CHECK_DATA)
 	$(TABLE) experiment=fig_split_sum $(RUN)
 
-test: setup ## the tests
+test: setup-dev ## the tests
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
 
-e2e: setup ## long end-to-end runs
+e2e: setup-dev ## long end-to-end runs
 	$(BIN)/python -m pytest -m slow
 
-bench: setup ## speed and error figures, each a JSON object on its last line
+bench: setup-dev ## speed and error figures, each a JSON object on its last line
 	$(BIN)/python -m benchmarks.speed.raster
 	$(BIN)/python -m benchmarks.speed.losses
 	$(BIN)/python -m benchmarks.speed.gaussians
 	$(BIN)/python -m benchmarks.speed.train_step
 	$(BIN)/python -m benchmarks.speed.speed_error --quick
 
-lint: setup ## ruff and pyright
+lint: setup-dev ## ruff and pyright
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 
-format: setup ## let ruff put things right
+format: setup-dev ## let ruff put things right
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-docs: setup ## docs/api.md: the reference of what rtgs exports, from its docstrings
+docs: setup-dev ## docs/api.md: the reference of what rtgs exports, from its docstrings
 	$(BIN)/python docs/make_api.py
 
 dashboard: setup ## browse the runs in MLflow on this machine (loopback)
 	$(BIN)/rtgs dashboard
 
-accept-steps: setup ## accept the changed source of pipeline steps (after bumping a version, or when the output is the same)
+accept-steps: setup-dev ## accept the changed source of pipeline steps (after bumping a version, or when the output is the same)
 	$(BIN)/python -m tests.pipelines.accept_steps
 
-contact-sheet: setup ## docs/images/scenes.jpg: every path-traced scene with its layers; prints their figures
+contact-sheet: setup-dev ## docs/images/scenes.jpg: every path-traced scene with its layers; prints their figures
 	$(BIN)/python -m rtgs.scenes.contact_sheet docs/images/scenes.jpg
 
 clean: ## remove the environment and build products (not the store)

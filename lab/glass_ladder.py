@@ -72,6 +72,7 @@ class Rung:
 
     what: str
     words: Callable[[Setting, RunConfig], list[str]]
+    method: str = "rtgs"
 
 
 def _given(setting: Setting) -> list[str]:
@@ -84,7 +85,7 @@ def _hull(*words: str) -> Callable[[Setting, RunConfig], list[str]]:
 
 def _paper(*words: str) -> Callable[[Setting, RunConfig], list[str]]:
     # What a file of the ablation says is overruled by SMALL: a word of its own is not.
-    return lambda *_: ["ablation=paper_glass", f"{_I}.count=0", "mesh.source=tsdf", *words]
+    return lambda *_: ["ablation=paper_glass", f"{_I}.count=0", *words]
 
 
 _UNBOUNDED = (f"{_T}.rim=0", f"{_T}.max_weight=0")
@@ -97,22 +98,23 @@ LADDER: dict[str, Rung] = {
     "hull_fixed": Rung("hull, its normals held fixed", _hull(f"{_T}.normal=mesh")),
     "tsdf": Rung("TSDF of the base set", lambda *_: ["ablation=mesh_tsdf"]),
     "two_stages": Rung("no third stage", lambda *_: ["ablation=two_stages"]),
-    "paper_truth_mesh": Rung(
-        "the paper's way, the true mesh for box and back",
-        lambda s, _: ["ablation=paper_glass", f"{_I}.count=0", *_given(s)],
+    "printed_truth_mesh": Rung(
+        "the paper as printed, the true mesh", lambda s, _: [f"{_I}.count=0", *_given(s)], "rtgs_printed"
     ),
-    "paper": Rung("the paper's way: full second stage, no interface, TSDF", _paper()),
-    "paper_propagation": Rung("the paper's way, normal propagation", lambda _, c: _paper()(_, c) + _propagation(c)),
+    "printed": Rung("the paper as printed", lambda *_: [f"{_I}.count=0"], "rtgs_printed"),
+    "paper_truth_mesh": Rung("the paper's glass, the true mesh", lambda s, c: [*_paper()(s, c), *_given(s)]),
+    "paper": Rung("the paper's glass", _paper()),
+    "paper_propagation": Rung("the paper's glass, normal propagation", lambda _, c: _paper()(_, c) + _propagation(c)),
     "paper_early_specular": Rung(
-        "the paper's way, L_spec from the second stage on",
+        "the paper's glass, L_spec from the second stage on",
         lambda _, c: _paper(f"method.loss.specular_start={c.method.reflection.start}")(_, c),
     ),
     "paper_mono_in_mask": Rung(
-        "the paper's way, L_mono of weight 0.2 in the mask",
+        "the paper's glass, L_mono of weight 0.2 in the mask",
         lambda _, c: _paper(f"method.loss.mono_normal_masked={_masked_gain(c)}")(_, c),
     ),
     "paper_early_third": Rung(
-        "the paper's way, third stage right after the second begins",
+        "the paper's glass, third stage right after the second begins",
         lambda _, c: _paper(f"{_T}.start={c.method.reflection.start + 0.05:g}")(_, c),
     ),
     "early_third_stage": Rung(
@@ -220,9 +222,10 @@ def sized(arguments: argparse.Namespace) -> list[str]:
 
 def run(name: str, setting: Setting, arguments: argparse.Namespace, seed: int) -> Measured | str:
     """Run the rung, or find it done; a string is why it failed."""
-    words = [f"scene={setting.scene}", "method=rtgs", f"preset={arguments.preset}", f"seed={seed}"]
+    rung = RUNGS[name]
+    words = [f"scene={setting.scene}", f"method={rung.method}", f"preset={arguments.preset}", f"seed={seed}"]
     words += [f"scene.split_file={setting.split}", "evaluation.lpips=false", *sized(arguments)]
-    words += RUNGS[name].words(setting, base_config(setting.scene, arguments))
+    words += rung.words(setting, base_config(setting.scene, arguments))
     words += [f"name={setting.scene}-{name}-{seed}", f"threads={arguments.threads}", "tracking=off"]
     done = subprocess.run(
         [sys.executable, "-m", "pipelines.run", *words, f"paths.root={arguments.root}"],

@@ -103,7 +103,7 @@ def _missing_photos(root: Path, scene: SceneSettings) -> list[str]:
 def _mask_remarks(root: Path, scene: SceneSettings) -> list[str]:
     if scene.masks_dir in ("", "masks") or (root / scene.masks_dir).is_dir():
         return []
-    return [f"without {root / scene.masks_dir}/, no figures inside the mask"]
+    return [f"without {root / scene.masks_dir}/, no figures inside the mask, and methods that see through glass stop"]
 
 
 def check_dataset(name: str, only: Sequence[str] = ()) -> int:

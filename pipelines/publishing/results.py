@@ -173,7 +173,7 @@ def result_table(tables: Sequence[EvaluationTable], seeds: Sequence[int] = ()) -
     from rtgs.evaluate.tables import summarize
 
     seeded = len(set(seeds)) > 1
-    header = ("scene", "method", "preset", *(["seed"] if seeded else []), "views", "PSNR", "SSIM", "LPIPS")
+    header = ("scene", "method", "preset", *(["seed"] if seeded else []), "views", "PSNR", "SSIM", "LPIPS", "FLIP")
     rows: list[tuple[str, ...]] = [(*header, "train", "memory", "surfels")]
     for index, row in enumerate(summarize(tables)):
         rows.append(
@@ -186,6 +186,7 @@ def result_table(tables: Sequence[EvaluationTable], seeds: Sequence[int] = ()) -
                 _figure(row.psnr, "{:.2f} dB"),
                 _figure(row.ssim, "{:.4f}"),
                 _figure(row.lpips_01, "{:.4f}"),
+                _figure(row.flip, "{:.4f}"),
                 _figure(row.train_seconds, "{:.1f} s"),
                 _figure(row.peak_memory_mb, "{:.0f} MB"),
                 _figure(row.surfels, "{:,}"),

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
+from pipelines.publishing.against_paper import ways_of
 from pipelines.publishing.results import evaluation_of
 from rtgs.config.schema import RunConfig
 from rtgs.evaluate.publish import PAPER_DATA, Measured, TableSpec, build_table
@@ -35,11 +36,19 @@ def write_experiment_table(runs: Sequence[tuple[RunConfig, Sequence[StepResult]]
     for one, results in asked:
         evaluation = evaluation_of(results)
         scene = one.scene.name  # not the table's name of it, which says what is a stand-in
-        measured.append(Measured(evaluation, one.seed, names.get(scene, scene)))
+        differs = ways_of(one, evaluation.facts.method, results) if config.table.data == PAPER_DATA else ()
+        measured.append(Measured(evaluation, one.seed, names.get(scene, scene), _mesh_seconds(results), differs))
     preset = measured[0].evaluation.facts.preset
-    spec = TableSpec(config.table.name, config.table.title or config.table.name, config.table.data)
+    spec = TableSpec(config.table.name, config.table.title or config.table.name, config.table.data, config.table.blocks)
     folder = f"{config.table.name}-{preset}" + ("-papers_data" if spec.data == PAPER_DATA else "")
     return list(write_table(config.paths.tables / folder, build_table(spec, measured)))
+
+
+def _mesh_seconds(results: Sequence[StepResult]) -> float:
+    """Of the mesh that a stage of the training waited for; 0: none did."""
+    trained = [result.step for result in results if result.step.name.startswith("train_")]
+    awaited = {step.fingerprint for each in trained for step in each.upstream if step.name == "extract_mesh"}
+    return sum(result.duration for result in results if result.step.fingerprint in awaited)
 
 
 def is_table_tracked(paths: Sequence[Path], place: str) -> bool:

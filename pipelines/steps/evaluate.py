@@ -29,6 +29,7 @@ TABLE_JSON = "metrics.json"
 TABLE_CSV = "metrics.csv"
 TRACKED = (  # means over the test views that go to the tracker, where they are measured
     *("psnr", "ssim", "lpips_01", "psnr_masked", "ssim_masked", "lpips_01_masked", "psnr_specular"),
+    *("flip", "flip_masked"),
     *("psnr_reflection", "psnr_reflection_scaled", "psnr_transmission", "psnr_transmission_scaled"),
     *("psnr_given_masks", "psnr_masked_given_masks", "ssim_masked_given_masks"),
     *("depth_error_masked", "depth_share_masked", "normal_degrees_masked", "normal_share_masked"),
@@ -141,4 +142,4 @@ def _judged(share: float) -> float | None:
     return None if math.isnan(share) else share
 
 
-STEP = StepKind("evaluate", 6, evaluate)
+STEP = StepKind("evaluate", 7, evaluate)

@@ -201,4 +201,4 @@ def _steps(context: StepContext) -> tuple[StepLine, ...]:
     return tuple(lines)
 
 
-STEP = StepKind("report", 6, report)
+STEP = StepKind("report", 7, report)

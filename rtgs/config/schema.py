@@ -125,6 +125,8 @@ class TableConfig:
     """``stand_in`` (scenes named after the paper's), ``paper`` (its data: differences are formed) or ``own``."""
     paper_scenes: dict[str, str] = field(default_factory=dict)
     """The paper's name of a scene by ours, where they differ."""
+    blocks: dict[str, str] = field(default_factory=dict)
+    """Headings by method: the rows of each stand together and are ranked among themselves. Empty: one block."""
 
     def __post_init__(self) -> None:
         refuse_unknown_words(self, "table")

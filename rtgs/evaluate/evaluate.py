@@ -10,6 +10,7 @@ from typing import Protocol
 from torch import Tensor
 
 from rtgs.evaluate.coverage import FRAMED_BY
+from rtgs.evaluate.flip import flip_map
 from rtgs.evaluate.images import ERROR_FULL_SCALE, error_map, error_scale_note, file_stem, write_png
 from rtgs.evaluate.layers import GLASS_LAYERS, LayerTruth, layer_scales, layer_scores, metrics_of, why_absent
 from rtgs.evaluate.metrics import psnr, quantized, ssim
@@ -124,11 +125,13 @@ def _score(render: TimedRender, view: PhotoView, settings: EvaluationSettings, m
     image, target, mask = render.image, view.image, view.mask
     values: dict[str, float | None] = dict.fromkeys(METRICS)
     values["psnr"], values["ssim"] = psnr(image, target), ssim(image, target)
+    seen = flip_map(image, target)
+    values["flip"] = float(seen.mean())
     values["render_seconds"] = render.seconds
     if render.framed is not None:
-        seen = render.framed >= FRAMED_BY
-        values["framed_share"] = float(seen.double().mean())
-        values["psnr_framed"] = psnr(image, target, mask=seen) if bool(seen.any()) else None
+        framed = render.framed >= FRAMED_BY
+        values["framed_share"] = float(framed.double().mean())
+        values["psnr_framed"] = psnr(image, target, mask=framed) if bool(framed.any()) else None
     if view.truth is not None and render.depth is not None:
         values["depth_off"] = depth_off(render.depth, view.truth)
     if model is not None:
@@ -137,6 +140,7 @@ def _score(render: TimedRender, view: PhotoView, settings: EvaluationSettings, m
     if settings.masked and mask is not None and bool(mask.any()):
         values["psnr_masked"] = psnr(image, target, mask=mask)
         values["ssim_masked"] = ssim(image, target, mask=mask)
+        values["flip_masked"] = float(seen[mask].mean())
         if model is not None:
             for convention in InputRange:
                 values[f"{convention.value}_masked"] = lpips(model, image, target, convention, mask=mask)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 from rtgs.core.refuse import refuse_unknown_words
 from rtgs.evaluate.records import EvaluationTable
-from rtgs.evaluate.tables import PAPER_SCORES, PaperScore
+from rtgs.evaluate.tables import PaperScore, paper_score
 
 DataKind = Literal["stand_in", "paper", "own"]
 STAND_IN: DataKind = "stand_in"
@@ -25,6 +25,9 @@ class TableSpec:
     name: str  # also the folder it is written into
     title: str
     data: DataKind = OWN_DATA
+    blocks: Mapping[str, str] = field(
+        default_factory=dict
+    )  # heading by method: its rows stand and compete by themselves
 
     def __post_init__(self) -> None:
         refuse_unknown_words(self, "table")
@@ -32,11 +35,19 @@ class TableSpec:
 
 @dataclass(frozen=True)
 class Measured:
-    """One evaluated run of a table. ``paper_scene``: the paper's name for the scene, where it has one."""
+    """One evaluated run of a table.
+
+    Attributes:
+        paper_scene: the paper's name for the scene, where it has one.
+        mesh_seconds: of the mesh that the training waited for; they count as training.
+        differs: in words, each way in which the run is not what the paper describes.
+    """
 
     evaluation: EvaluationTable
     seed: int
     paper_scene: str = ""
+    mesh_seconds: float = 0.0
+    differs: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -53,12 +64,14 @@ QUALITY = (
     Metric("psnr", "PSNR", 2, True),
     Metric("ssim", "SSIM", 3, True),
     Metric("lpips_01", "LPIPS", 3, False),
+    Metric("flip", "FLIP", 3, False),
 )
 COSTS = (
     Metric("psnr_masked", "PSNR in the mask", 2, True),
     Metric("ssim_masked", "SSIM in the mask", 3, True),
+    Metric("flip_masked", "FLIP in the mask", 3, False),
     Metric("psnr_masked_given_masks", "PSNR in the mask, given masks", 2, True),
-    Metric("train_seconds", "training s", 0, None),
+    Metric("train_seconds", "training s, mesh included", 0, None),
     Metric("peak_memory_mb", "memory MB", 0, None),
     Metric("surfels", "Gaussians", 0, None),
 )
@@ -97,6 +110,7 @@ class Cell:
     preset: str
     resolution: str
     views: int
+    differs: tuple[str, ...] = ()  # from the paper, in any of its runs
 
 
 @dataclass(frozen=True)
@@ -111,6 +125,19 @@ class PaperTable:
     def cell(self, method: str, scene: str) -> Cell | None:
         """The cell, or None where this method was not run on this scene (or failed)."""
         return self.cells.get((method, scene))
+
+    @property
+    def blocks(self) -> tuple[tuple[str, tuple[str, ...]], ...]:
+        """(heading, methods) of each block of rows; one without a heading where the table has none."""
+        groups: dict[str, list[str]] = {}
+        for method in self.methods:
+            groups.setdefault(block_of(self.spec, method), []).append(method)
+        return tuple((heading, tuple(methods)) for heading, methods in groups.items())
+
+
+def block_of(spec: TableSpec, method: str) -> str:
+    """The heading of the block in which a row stands; a row is called ``method`` or ``method, ablation``."""
+    return spec.blocks.get(method.split(",")[0], "")
 
 
 def build_table(spec: TableSpec, runs: Sequence[Measured]) -> PaperTable:
@@ -129,14 +156,14 @@ def build_table(spec: TableSpec, runs: Sequence[Measured]) -> PaperTable:
             raise ValueError(f"table {spec.name}: {facts.method} on {facts.scene} with seed {run.seed} comes twice")
         group.append(run)
     values = {key: {m.key: _value(m.key, group) for m in ALL} for key, group in groups.items()}
-    ranks = _ranks(values)
+    ranks = _ranks(values, spec)
     cells = {key: _cell(key, group, values[key], ranks[key], spec) for key, group in groups.items()}
     methods = tuple(dict.fromkeys(method for method, _ in groups))
     return PaperTable(spec, methods, tuple(dict.fromkeys(scene for _, scene in groups)), cells)
 
 
 def _value(key: str, group: Sequence[Measured]) -> Value | None:
-    found = [value for run in group if (value := _of_run(key, run.evaluation)) is not None]
+    found = [value for run in group if (value := _of_run(key, run)) is not None]
     if not found:
         return None
     mean = math.fsum(found) / len(found)
@@ -144,19 +171,25 @@ def _value(key: str, group: Sequence[Measured]) -> Value | None:
     return Value(mean, spread, len(found))
 
 
-def _of_run(key: str, evaluation: EvaluationTable) -> float | None:
+def _of_run(key: str, run: Measured) -> float | None:
+    evaluation = run.evaluation
     if key in ("train_seconds", "peak_memory_mb", "surfels"):
-        return getattr(evaluation.facts, key)
+        value = getattr(evaluation.facts, key)
+        return value + run.mesh_seconds if key == "train_seconds" and value is not None else value
     if key.startswith("object_"):
         return None if evaluation.object is None else getattr(evaluation.object, key.removeprefix("object_"))
     return evaluation.mean(key)
 
 
-def _ranks(values: Mapping[tuple[str, str], Mapping[str, Value | None]]) -> dict[tuple[str, str], dict[str, int]]:
-    """Places 1 to 3 within each scene; equal printed figures share a place; a method alone earns none."""
+def _ranks(
+    values: Mapping[tuple[str, str], Mapping[str, Value | None]], spec: TableSpec
+) -> dict[tuple[str, str], dict[str, int]]:
+    """Places 1 to 3 within each scene and block; equal printed figures share a place; a method alone earns none."""
     ranks: dict[tuple[str, str], dict[str, int]] = {key: {} for key in values}
-    for scene in {scene for _, scene in values}:
-        mine = [key for key in values if key[1] == scene]
+    groups: dict[tuple[str, str], list[tuple[str, str]]] = {}
+    for key in values:
+        groups.setdefault((key[1], block_of(spec, key[0])), []).append(key)
+    for mine in groups.values():
         for metric in ALL:
             found = {key: round(v.mean, metric.digits) for key in mine if (v := values[key][metric.key]) is not None}
             if metric.higher_is_better is None or len(found) < 2:
@@ -176,6 +209,7 @@ def _cell(
     spec: TableSpec,
 ) -> Cell:
     first = group[0].evaluation
-    paper = PAPER_SCORES.get((key[0], group[0].paper_scene)) if spec.data == PAPER_DATA else None
+    paper = paper_score(key[0], group[0].paper_scene) if spec.data == PAPER_DATA else None
     seeds = tuple(sorted(run.seed for run in group))
-    return Cell(*key, values, ranks, paper, seeds, first.facts.preset, first.resolution, len(first.rows))
+    differs = tuple(dict.fromkeys(way for run in group for way in run.differs))
+    return Cell(*key, values, ranks, paper, seeds, first.facts.preset, first.resolution, len(first.rows), differs)

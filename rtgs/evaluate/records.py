@@ -12,7 +12,10 @@ from rtgs.core import records
 from rtgs.core.errors import RtgsError
 
 FORMAT = "rtgs-evaluation"
-VERSION = 5  # 2: layers; 3: transmission, given masks; 4: surface in the mask, object's mesh; 5: what is framed
+VERSION = (
+    6  # 2: layers; 3: transmission, given masks; 4: surface in the mask, object's mesh; 5: what is framed; 6: FLIP
+)
+_READ = (5, VERSION)  # a figure that a version did not know is absent
 LAYER_METRICS = (
     "psnr_specular",
     "psnr_diffuse_part",
@@ -28,17 +31,19 @@ WHOLE_SURFACE_METRIC = "depth_off"  # share of the whole picture whose depth is 
 FRAMED_METRICS = ("psnr_framed", "framed_share")
 # Seen through the test views' own masks instead of the mesh's silhouette (method.md 7; decision 21).
 GIVEN_MASK_METRICS = ("psnr_given_masks", "psnr_masked_given_masks", "ssim_masked_given_masks")
-# In the order of the columns. Higher is better for psnr*, ssim*, *_share*; lower for lpips*, *_error*, *_degrees*,
-# *_off.
+# In the order of the columns. Higher is better for psnr*, ssim*, *_share*; lower for lpips*, flip*, *_error*,
+# *_degrees*, *_off.
 METRICS = (
     "psnr",
     "ssim",
     "lpips_01",
     "lpips_11",
+    "flip",
     "psnr_masked",
     "ssim_masked",
     "lpips_01_masked",
     "lpips_11_masked",
+    "flip_masked",
     *LAYER_METRICS,
     *GIVEN_MASK_METRICS,
     *SURFACE_METRICS,
@@ -153,7 +158,7 @@ class EvaluationTable:
     def _present(self, metric: str) -> list[float]:
         if metric not in (*METRICS, *GLASS_METRICS):
             raise KeyError(f"no metric {metric!r}; there are {', '.join((*METRICS, *GLASS_METRICS))}")
-        values = (row.values.get(metric) if metric in GLASS_METRICS else row.values[metric] for row in self.rows)
+        values = (row.values.get(metric) for row in self.rows)
         return [value for value in values if value is not None]
 
 
@@ -186,7 +191,7 @@ def read_json(path: Path) -> EvaluationTable:
     """
     document = records.read_json(path)
     found = (document.get("format"), document.get("version"))
-    if found != (FORMAT, VERSION):
+    if found not in [(FORMAT, version) for version in _READ]:
         raise RtgsError(f"{path} is not an evaluation: format {found}, expected {(FORMAT, VERSION)}")
     names = {item.name for item in fields(EvaluationTable)} - {"rows"}
     values = {name: document[name] for name in names & document.keys()} | {"rows": document.get("views")}

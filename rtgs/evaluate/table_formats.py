@@ -67,11 +67,8 @@ def notes(table: PaperTable) -> tuple[str, ...]:
     presets = sorted({cell.preset for cell in cells})
     seeds = sorted({len(cell.seeds) for cell in cells})
     found = [f"Preset {', '.join(presets)}; {'; '.join(sizes)}."]
-    if any(cell.paper is not None for cell in cells) and presets != [PAPER_PRESET]:
-        found.append(
-            f"The paper's figures are those of its whole schedule (preset {PAPER_PRESET}): differences of preset "
-            f"{', '.join(presets)} to them are no verdict."
-        )
+    if any(cell.paper is not None for cell in cells):
+        found += _against_paper(table)
     if table.spec.data == STAND_IN:
         found.append(
             "The scenes are path-traced stand-ins named after the paper's: its figures are for other data and not "
@@ -84,19 +81,54 @@ def notes(table: PaperTable) -> tuple[str, ...]:
         found.append("One seed: the spread is not known; differences of a few tenths of a dB may be noise.")
     if len(cells) < len(table.methods) * len(table.scenes):
         found.append("Empty cells: the run failed, or was not asked for.")
-    absent = [metric.title for metric in QUALITY if all(cell.values[metric.key] is None for cell in cells)]
-    if absent:
-        found.append(f"{', '.join(absent)}: not measured (`rtgs weights` says what is missing).")
+    for metric in QUALITY:
+        if all(cell.values[metric.key] is None for cell in cells):
+            why = "`rtgs weights` says what is missing" if metric.key.startswith("lpips") else "by an older version"
+            found.append(f"{metric.title}: not measured ({why}).")
     return tuple(found)
 
 
+def _against_paper(table: PaperTable) -> list[str]:
+    """Every way in which the runs differ from what the paper describes: what all have in common, then row by row; of
+    the rows beside which its figures stand."""
+    ways = {
+        method: tuple(dict.fromkeys(way for scene in table.scenes for way in _differs(table, method, scene)))
+        for method in table.methods
+        if any(cell.paper is not None for cell in table.cells.values() if cell.method == method)
+    }
+    common = [way for way in next(iter(ways.values())) if all(way in others for others in ways.values())]
+    found = []
+    presets = sorted({cell.preset for cell in table.cells.values()})
+    if presets != [PAPER_PRESET]:
+        found.append(
+            f"The paper's figures are those of its whole schedule (preset {PAPER_PRESET}): differences of preset "
+            f"{', '.join(presets)} to them are no verdict."
+        )
+    if common:
+        found.append(f"All runs differ from the paper: {'; '.join(common)}.")
+    for method, own in ways.items():
+        rest = [way for way in own if way not in common]
+        if rest:
+            found.append(f"{method} {'also ' if common else ''}differs from the paper: {'; '.join(rest)}.")
+    return found
+
+
+def _differs(table: PaperTable, method: str, scene: str) -> tuple[str, ...]:
+    cell = table.cell(method, scene)
+    return () if cell is None else cell.differs
+
+
 def _rows(
-    table: PaperTable, metrics: Iterable[Metric], marks: Mapping[int, tuple[str, str]], pm: str
+    table: PaperTable,
+    methods: Sequence[str],
+    metrics: Iterable[Metric],
+    marks: Mapping[int, tuple[str, str]],
+    pm: str,
 ) -> list[list[str]]:
     """One row per method: the metrics of every scene."""
     metrics = tuple(metrics)
     rows = []
-    for method in table.methods:
+    for method in methods:
         row = [method]
         for scene in table.scenes:
             cell = table.cell(method, scene)
@@ -155,11 +187,18 @@ def _blocks(
     table: PaperTable, marks: Mapping[int, tuple[str, str]], pm: str
 ) -> list[tuple[str, list[str], list[list[str]]]]:
     """(heading, header, rows) of every part of the table."""
-    blocks = [("", _header(table, QUALITY), _rows(table, QUALITY, marks, pm))]
-    parts = {"Inside the mask, and what it cost": (*COSTS, *MESH), "Against the truth of path-traced scenes": TRUTH}
-    for heading, metrics in parts.items():
-        known = [m for m in metrics if any(cell.values[m.key] is not None for cell in table.cells.values())]
-        blocks += [(heading, _header(table, known), _rows(table, known, marks, pm))] if known else []
+    parts = {
+        "": QUALITY,
+        "Inside the mask, and what it cost": (*COSTS, *MESH),
+        "Against the truth of path-traced scenes": TRUTH,
+    }
+    blocks = []
+    for part, metrics in parts.items():
+        values = [cell.values for cell in table.cells.values()]
+        known = [m for m in metrics if not part or any(each[m.key] is not None for each in values)]
+        for block, methods in table.blocks if known else ():
+            heading = ": ".join(text for text in (block, part) if text)
+            blocks.append((heading, _header(table, known), _rows(table, methods, known, marks, pm)))
     if paper := _paper_rows(table):
         blocks.append(("The paper's figures", _paper_header(table), paper))
     return blocks
@@ -190,6 +229,7 @@ def _escaped_pipe(text: str) -> str:
     return text.replace("|", "\\|")
 
 
+# The paper has the first three of QUALITY.
 _PAPER_COLUMNS = ("paper_psnr", "paper_ssim", "paper_lpips")
 _PAPER_COLUMNS += ("psnr_minus_paper", "ssim_minus_paper", "lpips_minus_paper")
 
@@ -226,7 +266,8 @@ def latex(table: PaperTable) -> str:
     """A ``table*`` environment; needs the package booktabs."""
     caption = " ".join([f"{table.spec.title}.", _LEGEND.format("bold, underlined, italic"), *notes(table)])
     lines = [r"\begin{table*}", r"\centering", rf"\caption{{{_tex(caption)}}}"]
-    for _, header, rows in _blocks(table, _LATEX, r" $\pm$ "):
+    for heading, header, rows in _blocks(table, _LATEX, r" $\pm$ "):
+        lines += [rf"\par\smallskip\emph{{{_tex(heading)}}}\par"] if heading else []
         lines += [rf"\begin{{tabular}}{{l{'r' * (len(header) - 1)}}}", r"\toprule"]
         lines.append(" & ".join(_tex(cell) for cell in header) + r" \\")
         lines.append(r"\midrule")

@@ -53,6 +53,14 @@ PAPER_SCORES: dict[tuple[str, str], PaperScore] = {
 }
 
 
+def paper_score(row: str, scene: str) -> PaperScore | None:
+    """What the paper prints for a row of a table, ``method`` or ``method, ablation``; None: nothing.
+
+    The paper's RT-GS is that of ``rtgs_printed`` and of ``rtgs``.
+    """
+    return PAPER_SCORES.get((row.replace("rtgs_printed", "rtgs", 1), scene))
+
+
 @dataclass(frozen=True)
 class SummaryRow:
     """One run in a table of runs. None: not measured."""
@@ -65,6 +73,7 @@ class SummaryRow:
     psnr: float | None
     ssim: float | None
     lpips_01: float | None
+    flip: float | None
     train_seconds: float | None
     peak_memory_mb: float | None
     surfels: int | None
@@ -85,6 +94,7 @@ def summarize(tables: Sequence[EvaluationTable]) -> list[SummaryRow]:
                 psnr=table.mean("psnr"),
                 ssim=table.mean("ssim"),
                 lpips_01=table.mean("lpips_01"),
+                flip=table.mean("flip"),
                 train_seconds=facts.train_seconds,
                 peak_memory_mb=facts.peak_memory_mb,
                 surfels=facts.surfels,

@@ -15,7 +15,7 @@ _MATERIAL_RATES = ("specular_logits", "roughness_logits", "f0_logits")
 # What recipes of the stages before the third spell for these settings, which they do not read. It is what the defaults
 # once were, and stays when they change: else all those artifacts would be made again.
 _UNREAD = TransmittanceSettings(
-    enabled=False, max_gain=None, interface=InterfaceSettings(normal_loss=0.2, normal_hold=0.0)
+    enabled=False, max_gain=None, weight_bound="clamp", interface=InterfaceSettings(normal_loss=0.2, normal_hold=0.0)
 )
 
 
@@ -43,10 +43,15 @@ def without_transmittance(settings: MethodSettings) -> MethodSettings:
 
 
 def as_lit(settings: MethodSettings) -> MethodSettings:
-    """Nothing of the walls where their weights are learned."""
-    if settings.transmittance.wall.light == "fresnel":
-        return settings
-    return replace(settings, transmittance=replace(settings.transmittance, wall=WallSettings()))
+    """Nothing of the walls where their weights are learned, nothing of the bound of learned weights where there is
+    none."""
+    transmittance = settings.transmittance
+    learned = transmittance.wall.light == "learned"
+    if learned:
+        transmittance = replace(transmittance, wall=WallSettings())
+    if not (learned and transmittance.interface.count > 0 and transmittance.max_weight > 0):
+        transmittance = replace(transmittance, weight_bound="clamp")
+    return replace(settings, transmittance=transmittance)
 
 
 def _without_losses(loss: LossSettings, prefixes: tuple[str, ...]) -> LossSettings:

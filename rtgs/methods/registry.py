@@ -2,7 +2,7 @@
 
 Without torch. ``method.name`` is one of
 
-- ``2dgs``, ``3dgs``, ``envgs``, ``rtgs``: of this package;
+- ``2dgs``, ``3dgs``, ``envgs``, ``rtgs``, ``rtgs_printed``: of this package;
 - a name that an installed package declares as an entry point of the group ``rtgs.methods``;
 - ``package.module:ATTRIBUTE``, any importable :class:`~rtgs.methods.spec.MethodSpec`.
 """
@@ -13,12 +13,12 @@ import difflib
 import importlib
 from importlib import metadata
 
-from rtgs.methods import envgs, gs2d, gs3d, rtgs
+from rtgs.methods import envgs, gs2d, gs3d, rtgs, rtgs_printed
 from rtgs.methods.spec import MethodSpec
 
 ENTRY_POINTS = "rtgs.methods"
 REACHES = ()  # by name only what others install: the digest of its source is in the recipe of its steps
-_OWN = {spec.name: spec for spec in (gs2d.SPEC, gs3d.SPEC, envgs.SPEC, rtgs.SPEC)}
+_OWN = {spec.name: spec for spec in (gs2d.SPEC, gs3d.SPEC, envgs.SPEC, rtgs.SPEC, rtgs_printed.SPEC)}
 
 
 def method_names() -> tuple[str, ...]:

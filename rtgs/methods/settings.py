@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from rtgs.core.errors import RtgsError
-from rtgs.core.recipe import UNLESS_DEFAULT
+from rtgs.core.recipe import UNLESS, UNLESS_DEFAULT
 from rtgs.core.refuse import refuse_bad_numbers, refuse_unknown_words, refuse_unless
 from rtgs.gaussians.settings import DensitySettings, InitSettings, MaterialSettings, OptimizerSettings
 from rtgs.optics.settings import OpticsSettings, WallSettings
@@ -209,6 +209,8 @@ class TransmittanceSettings:
     # pixels, for an S_max of 16 alone lets its rim glow and darkens the set (0: none), and how many pixels around them
     # get straight rays too, for interface surfels reach over the outline.
     max_weight: float = 1.0
+    # "clamp": w_r above max_weight teaches roughness and f0 nothing; "smooth": it nears max_weight and always does.
+    weight_bound: Literal["clamp", "smooth"] = field(default="smooth", metadata={"recipe": UNLESS, "value": "clamp"})
     rim: int = 2
     # Share of the masked pixels whose base depth is the object's first surface; with more the object is opaque and the
     # stage left out (docs/lab/transmittance.md: thin glass 0.05 to 0.5). 1: never.
@@ -228,8 +230,9 @@ class TransmittanceSettings:
     per_cell: int = 5
     most_hits: float = 80.0  # of a ray through the random set: its surfels are shrunk until no more are expected
     freeze_base: bool = True  # decision 18: density control and resets of the base set end here; False: EnvGS's windows
-    # Decision 21: of the mesh, needs no mask at test views; "given": the scene's.
-    test_masks: Literal["silhouette", "given"] = "silhouette"
+    # Decision 21: of the mesh, needs no mask at test views; "given": the scene's
+    # where the mesh is met too; "as_trained": the scene's as they are, as in training.
+    test_masks: Literal["silhouette", "given", "as_trained"] = "silhouette"
     offset: float = 1e-4  # of the first bounce's start, times the extent
     opaque: float = 1 / 255  # no second bounce where the first leaves less light than this
     densify_from: int = 500

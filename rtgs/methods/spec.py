@@ -28,7 +28,8 @@ SURFACE = "surface"  # Gaussians with a normal and a depth: losses on surfaces, 
 MIRROR = "mirror"  # reflected light of its own
 MICROFACET = "microfacet"  # a weight of reflected light that follows from roughness and reflectance
 GLASS = "glass"  # a stage for what is seen through transparent objects
-FEATURES = (SURFACE, MIRROR, MICROFACET, GLASS)
+BEYOND_PAPER = "beyond_paper"  # what rtgs adds to the paper: glass on a mesh of its own, lit by physics; first values
+FEATURES = (SURFACE, MIRROR, MICROFACET, GLASS, BEYOND_PAPER)
 
 StartOf = Callable[["MethodSettings", "ScheduleSettings"], int]
 Reads = Callable[["MethodSettings"], "MethodSettings"]

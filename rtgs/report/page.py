@@ -15,7 +15,8 @@ from torch import Tensor
 from rtgs.core.cameras import Camera
 from rtgs.core.decisions import Decision
 from rtgs.evaluate.coverage import FRAMED_BY
-from rtgs.evaluate.images import ERROR_COLORMAP, ERROR_FULL_SCALE, error_map, to_bytes
+from rtgs.evaluate.flip import FLIP_COLORMAP, flip_map
+from rtgs.evaluate.images import ERROR_COLORMAP, ERROR_FULL_SCALE, colorize, error_map, to_bytes
 from rtgs.evaluate.records import GLASS_METRICS, EvaluationTable, ViewScore
 from rtgs.report.figures import (
     DEPTH_COLORMAP,
@@ -224,12 +225,14 @@ _ALWAYS = (
     Column("ssim", "SSIM", 4),
     Column("lpips_01", "LPIPS [0,1]", 4),
     Column("lpips_11", "LPIPS [−1,1]", 4),
+    Column("flip", "FLIP", 4),
 )
 _WHEN_PRESENT = (
     Column("psnr_masked", "PSNR in mask", 2),
     Column("ssim_masked", "SSIM in mask", 4),
     Column("lpips_01_masked", "LPIPS [0,1] in mask", 4),
     Column("lpips_11_masked", "LPIPS [−1,1] in mask", 4),
+    Column("flip_masked", "FLIP in mask", 4),
     Column("psnr_specular", "PSNR on specular objects", 2),
     Column("psnr_diffuse_part", "PSNR off them", 2),
     Column("psnr_reflection", "PSNR of the reflection", 2),
@@ -322,24 +325,18 @@ class _Drawn:
 
 def _draw(view: ReportView) -> list[_Drawn]:
     """Photo, render, then the maps, as pixels."""
-    error, caption = error_map(view.render, view.photo), "mean over RGB of |render − photo|"
-    if view.mask is not None and view.mask.any():
-        error, caption = outlined(error, view.mask), f"{caption}; outlined: the mask"
-    drawn = [
-        _Drawn(to_bytes(view.photo), Picture("", "Photo")),
-        _Drawn(to_bytes(view.render), Picture("", "Render")),
-        _Drawn(
-            error,
-            Picture(
-                "",
-                "Error",
-                caption,
-                colorbar_uri(ERROR_COLORMAP),
-                "0",
-                f"≥ {ERROR_FULL_SCALE:g}",
-            ),
+    drawn = [_Drawn(to_bytes(view.photo), Picture("", "Photo")), _Drawn(to_bytes(view.render), Picture("", "Render"))]
+    flipped = colorize(flip_map(view.render, view.photo), 0.0, 1.0, FLIP_COLORMAP)
+    for pixels, title, caption, colormap, most in (
+        (
+            error_map(view.render, view.photo),
+            *("Error", "mean over RGB of |render − photo|", ERROR_COLORMAP, f"≥ {ERROR_FULL_SCALE:g}"),
         ),
-    ]
+        (flipped, "FLIP", "difference as it is seen when render and photo alternate", FLIP_COLORMAP, "1"),
+    ):
+        if view.mask is not None and view.mask.any():
+            pixels, caption = outlined(pixels, view.mask), f"{caption}; outlined: the mask"
+        drawn.append(_Drawn(pixels, Picture("", title, caption, colorbar_uri(colormap), "0", most)))
     depth = None if view.depth is None else depth_picture(view.depth, view.alpha)
     if depth is not None:
         caption = "z-depth in world units, even steps in 1/z; grey: alpha below one half"

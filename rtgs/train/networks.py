@@ -18,7 +18,7 @@ def networks_of(loss: LossSettings) -> tuple[PretrainedFile, ...]:
     """The files that the form of the perceptual loss reads; none where the loss is off."""
     if loss.perceptual == 0:
         return ()
-    return (VGG16,) if loss.perceptual_form == "vgg_l1" else (VGG16, LPIPS_VGG)
+    return (VGG16,) if loss.perceptual_form == "vgg16_l1" else (VGG16, LPIPS_VGG)
 
 
 def named_in_key(loss: LossSettings, present: Iterable[tuple[str, str]]) -> Named:

@@ -51,6 +51,6 @@ class PerceptualLoss:
     def _feature_distance(self, image: Tensor, target: Tensor) -> Tensor:
         """The paper's form: mean L1 distance of raw features, mean over the five blocks."""
         shift, scale = (torch.tensor(values).view(1, 3, 1, 1) for values in (SHIFT, SCALE))
-        activations = self.features((torch.stack((image, target)) - shift) / scale)
+        activations = self.features((2 * torch.stack((image, target)) - 1 - shift) / scale)  # they are of [-1, 1]
         distances = [(activation[0] - activation[1]).abs().mean() for activation in activations]
         return torch.stack(distances).mean()

@@ -12,7 +12,7 @@ from rtgs.core.recipe import UNLESS_DEFAULT
 from rtgs.core.refuse import refuse_bad_numbers, refuse_unknown_words, refuse_unless
 
 MonoNormalForm = Literal["cosine", "envgs"]
-PerceptualForm = Literal["lpips", "vgg_l1"]
+PerceptualForm = Literal["lpips", "vgg16_l1"]
 TransmissionDepthForm = Literal["accum", "mean", "per_hit"]
 LOSS_WEIGHTS = ("l1", "dssim", "normal", "mono_normal", "distortion", "perceptual", "specular", "transmission_depth")
 """The fields of :class:`LossSettings` that are weights of terms."""
@@ -44,7 +44,7 @@ class LossSettings:
     # Perceptual loss of the second stage, where the VGG weights are there (decision 20).
     perceptual: float = 0.0  # RT-GS and EnvGS 0.01
     perceptual_start: float = 0.35  # 21,000 of 60,000
-    perceptual_form: PerceptualForm = "lpips"  # LPIPS-VGG on [0, 1] images, as EnvGS; "vgg_l1": L1 of raw VGG features
+    perceptual_form: PerceptualForm = "lpips"  # LPIPS-VGG on [0, 1] images, as EnvGS; "vgg16_l1": raw features
     perceptual_crop: int = 64  # side of the random crop it looks at: the whole image would dwarf the rest of a step
     # L_spec, mean of mask * ReLU(target - k_s): where the scene has masks of transparent objects (decision 10).
     specular: float = 0.0  # RT-GS 0.2, from its third stage on

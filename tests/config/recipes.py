@@ -37,7 +37,7 @@ OVERRIDES = (
     ("rtgs", "method.transmittance.interface.normal_hold=5.0 method.transmittance.interface.normal_loss=0.2"),
     ("rtgs", "method.transmittance.max_gain=null method.transmittance.interface.count=0"),
     ("rtgs", "method.transmittance.enabled=false method.loss.specular=0.1"),
-    ("rtgs", "method.loss.specular_start=0.35 method.loss.perceptual=0.02 method.loss.perceptual_form=vgg_l1"),
+    ("rtgs", "method.loss.specular_start=0.35 method.loss.perceptual=0.02 method.loss.perceptual_form=vgg16_l1"),
     ("rtgs", "method.loss.transmission_depth_form=mean method.transmittance.compositing=sum"),
     ("rtgs", "method.reflection.direction_gradient=last_sh method.reflection.sh_direction=raw"),
     ("rtgs", "method.reflection.init_color=bright method.reflection.background=mean"),

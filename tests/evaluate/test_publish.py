@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import io
 
 import pytest
@@ -172,3 +173,53 @@ def test_the_same_run_twice_and_no_run_are_refused():
         build_table(STAND_IN, [])
     with pytest.raises(ValueError, match=r"table\.data='mine'"):
         TableSpec("t", "T", "mine")
+
+
+BLOCKS = TableSpec("table3", "Table 3", "paper", {"rtgs_printed": "As printed", "rtgs": "Ours"})
+
+
+def test_two_blocks_stand_and_compete_by_themselves(tmp_path):
+    rows = [
+        ("rtgs_printed", 20.0),
+        ("rtgs_printed, no_depth_loss", 19.0),
+        ("rtgs", 27.0),
+        ("rtgs, no_depth_loss", 26.0),
+    ]
+    table = build_table(BLOCKS, [run(method, "ball_statue", psnr, masked=psnr - 3) for method, psnr in rows])
+    ranks = {method: cell.ranks["psnr"] for (method, _), cell in table.cells.items()}
+    assert ranks == {"rtgs_printed": 1, "rtgs_printed, no_depth_loss": 2, "rtgs": 1, "rtgs, no_depth_loss": 2}
+    text = markdown(table)
+    first, second = text.index("## As printed\n"), text.index("## Ours\n")
+    assert first < text.index("| rtgs_printed | **20.00**") < second < text.index("| rtgs | **27.00**")
+    assert "## As printed: Inside the mask" in text
+    texts = {path.suffix: path.read_text() for path in write_table(tmp_path, table)}
+    assert "As printed" in texts[".tex"]
+    assert "<h2>As printed</h2>" in texts[".html"]
+    printed = table.cell("rtgs_printed, no_depth_loss", "ball_statue")
+    assert printed is not None
+    assert printed.paper is not None
+    assert printed.paper.psnr == 25.941  # the paper's row, for both blocks
+
+
+def test_every_way_in_which_runs_differ_from_the_paper_stands_under_its_figures():
+    short, own = "schedule.total is 2000 instead of 60000", "method.optics.max_gain is 1 instead of 0"
+    runs = [
+        dataclasses.replace(run("rtgs_printed", "sedan", 20.0), differs=(short,)),
+        dataclasses.replace(run("rtgs", "sedan", 21.0), differs=(short, own)),
+        dataclasses.replace(run("2dgs", "sedan", 21.0), differs=("the paper has no such row",)),
+    ]
+    text = markdown(build_table(TableSpec("t", "T", "paper"), runs))
+    assert f"- All runs differ from the paper: {short}." in text
+    assert f"- rtgs also differs from the paper: {own}." in text
+    assert "rtgs_printed also" not in text
+    assert "no such row" not in text
+    assert short not in markdown(build_table(TableSpec("t", "T", "stand_in"), runs))  # no figures of the paper there
+
+
+def test_seconds_of_training_have_the_mesh_it_waited_for():
+    table = build_table(
+        STAND_IN, [dataclasses.replace(run("rtgs", "a", 30.0), mesh_seconds=12.0), run("2dgs", "a", 29.0)]
+    )
+    seconds = {method: cell.values["train_seconds"] for (method, _), cell in table.cells.items()}
+    assert {method: value and value.mean for method, value in seconds.items()} == {"rtgs": 72.0, "2dgs": 60.0}
+    assert "training s, mesh included" in markdown(table)

@@ -95,7 +95,9 @@ class GlassTwin:
         if self.settings.max_weight > 0 and self.settings.interface.count > 0:
             near_bound = (own - self.settings.max_weight).abs() < 1e-4
             self.fragile |= inside & (near_bound if near_bound.ndim == 1 else near_bound.any(0))
-            own = own.clamp_max(self.settings.max_weight)
+            most = self.settings.max_weight
+            smooth = own / (1 + (own / most) ** 4) ** 0.25
+            own = smooth if self.settings.weight_bound == "smooth" else own.clamp_max(most)
         passing = weights.transmission
         if self.thin:
             own = thin_wall(mirrored.cosine, self.settings.wall.index)

@@ -29,6 +29,7 @@ CASES: dict[str, dict[str, object]] = {
     "no mesh guide": {"second_bounce": "first_bounce"},
     "base set inside": {"first_bounce": "base"},
     "bounded weight, rim": {"max_gain": 16.0, "max_weight": 0.3, "rim": 1, "sh_degree": 1},
+    "clamped weight": {"max_gain": 16.0, "max_weight": 0.3, "weight_bound": "clamp"},
 }
 
 

@@ -36,7 +36,7 @@ def test_an_image_no_larger_than_the_crop_is_compared_whole(network: Lpips):
     torch.testing.assert_close(found, network(image, target, InputRange.ZERO_ONE))
 
 
-@pytest.mark.parametrize("form", ["lpips", "vgg_l1"])
+@pytest.mark.parametrize("form", ["lpips", "vgg16_l1"])
 def test_a_crop_gets_the_gradient_and_the_rest_of_the_image_none(network: Lpips, form: str):
     image, target = pair()
     image.requires_grad_()
@@ -53,7 +53,7 @@ def test_a_crop_gets_the_gradient_and_the_rest_of_the_image_none(network: Lpips,
 def test_raw_features_need_no_heads_of_lpips(network: Lpips, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(weights, "weight_folders", lambda: (tmp_path,))
     monkeypatch.setattr(vgg, "verify_weights", lambda file, path: None)  # a tiny one in the place of the published
-    form = LossSettings(perceptual=0.01, perceptual_form="vgg_l1", perceptual_crop=32)
+    form = LossSettings(perceptual=0.01, perceptual_form="vgg16_l1", perceptual_crop=32)
     with pytest.raises(MissingWeights, match="vgg16"):
         PerceptualLoss(form)
     torch.save(vgg_tensors(TINY), tmp_path / weights.VGG16.filename)
@@ -63,11 +63,23 @@ def test_raw_features_need_no_heads_of_lpips(network: Lpips, tmp_path: Path, mon
         PerceptualLoss(replace(form, perceptual_form="lpips"))
 
 
+def test_raw_features_are_those_of_the_colours_that_the_network_was_trained_on(network: Lpips):
+    """torchvision's mean and deviation of colours in [0, 1] are those of lpips in [-1, 1], to its three digits."""
+    image, target = pair()
+    mean, deviation = (
+        torch.tensor(values).view(1, 3, 1, 1) for values in ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
+    )
+    features = network.features((torch.stack((image, target)) - mean) / deviation)
+    expected = torch.stack([(block[0] - block[1]).abs().mean() for block in features]).mean()
+    found = PerceptualLoss(LossSettings(perceptual_form="vgg16_l1"), network)(image, target, torch.Generator())
+    torch.testing.assert_close(found, expected, rtol=1e-3, atol=0)
+
+
 def test_every_place_of_the_image_is_drawn(network: Lpips):
     image, target = pair(34, 33)
     generator = torch.Generator().manual_seed(1)
     seen = torch.zeros(34, 33, dtype=torch.bool)
-    loss = PerceptualLoss(LossSettings(perceptual_crop=32, perceptual_form="vgg_l1"), network)
+    loss = PerceptualLoss(LossSettings(perceptual_crop=32, perceptual_form="vgg16_l1"), network)
     for _ in range(12):
         leaf = image.clone().requires_grad_()
         loss(leaf, target, generator).backward()

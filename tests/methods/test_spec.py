@@ -30,6 +30,7 @@ def settings(start: float, third: float = 0.6, enabled: bool = True) -> MethodSe
 
 def stages(chosen: MethodSettings, *, transparent: bool) -> list[tuple[str, int, int]]:
     found = find_method("rtgs").timeline(chosen, PLAN, transparent=transparent)
+    assert find_method("rtgs_printed").timeline(chosen, PLAN, transparent=transparent) == found
     return [(stage.name, stage.from_step, stage.until) for stage in found]
 
 
@@ -75,9 +76,9 @@ def test_a_method_of_one_stage_may_read_all_its_settings():
 
 
 def test_the_methods_of_this_package():
-    assert method_names()[:4] == ("2dgs", "3dgs", "envgs", "rtgs")
+    assert method_names()[:5] == ("2dgs", "3dgs", "envgs", "rtgs", "rtgs_printed")
     assert all(is_own(spec) for spec in own_methods())
-    assert [spec.object_stage(settings(0.3)) for spec in own_methods()] == [None, None, None, TRANSMITTANCE]
+    assert [spec.object_stage(settings(0.3)) for spec in own_methods()] == [None] * 3 + [TRANSMITTANCE] * 2
     assert find_method("rtgs").object_stage(settings(0.3, enabled=False)) is None
 
 

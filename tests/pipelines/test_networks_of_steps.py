@@ -48,7 +48,7 @@ def keys(graph: RunGraph) -> list[str]:
 
 def test_networks_belong_to_the_recipe_where_the_loss_reads_them():
     spec = find_method("rtgs")
-    for weight, form, named in ((0.0, "lpips", ()), (0.01, "lpips", BOTH), (0.01, "vgg_l1", BOTH[1:])):
+    for weight, form, named in ((0.0, "lpips", ()), (0.01, "lpips", BOTH), (0.01, "vgg16_l1", BOTH[1:])):
         method = MethodSettings(name="rtgs", loss=LossSettings(perceptual=weight, perceptual_form=form))
         params = StageParams(method, small_schedule(30), 0, "reflection", 10, 30)
         bare, whole, half = (train_step(spec, params, networks=found) for found in ((), BOTH, BOTH[:1]))
@@ -58,7 +58,7 @@ def test_networks_belong_to_the_recipe_where_the_loss_reads_them():
 
 
 def test_a_key_counts_only_the_files_that_the_form_reads(capture: Path, here: Path):  # noqa: F811
-    forms = ("method.loss.perceptual_form=lpips", "method.loss.perceptual_form=vgg_l1")
+    forms = ("method.loss.perceptual_form=lpips", "method.loss.perceptual_form=vgg16_l1")
     found = []
     for files in ((), (VGG16,), (LPIPS_VGG,)):  # each comes to those before
         put(here, *files)

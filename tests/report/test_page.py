@@ -129,7 +129,7 @@ def test_page_is_self_contained(tmp_path: Path) -> None:
     namespaces = {"http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"}  # names, never fetched
     assert set(re.findall(r"https?://[\w./-]+", page)) <= namespaces
     pictures = [address for address in parsed.addresses if address.startswith("data:image/jpeg")]
-    assert len(pictures) == 2 * 6 + 1  # photo, render, error, depth, normal, alpha for two views, and the mesh
+    assert len(pictures) == 2 * 7 + 1  # photo, render, error, FLIP, depth, normal, alpha for two views, and the mesh
     with Image.open(io.BytesIO(base64.b64decode(pictures[0].split(",")[1]))) as picture:
         assert picture.size == (48, 32)
 

@@ -14,7 +14,7 @@ from rtgs.train.settings import LossSettings
 from tests.small_networks import look_in, put
 
 LPIPS = LossSettings(perceptual=0.01)
-L1 = replace(LPIPS, perceptual_form="vgg_l1")
+L1 = replace(LPIPS, perceptual_form="vgg16_l1")
 VGG_NAMED, HEADS_NAMED = (("vgg16", "1" * 64), ("lpips_vgg", "2" * 64))
 BOTH = (VGG_NAMED, HEADS_NAMED)
 

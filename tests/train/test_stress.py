@@ -2,39 +2,97 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import pytest
 import torch
-from training_cases import small_method, small_scene, small_schedule, small_trainer
+from training_cases import small_method, small_scene, small_schedule
 
 from rtgs.gaussians.settings import OptimizerSettings
+from rtgs.mesh.container import ObjectMesh
+from rtgs.methods import create_method
+from rtgs.methods.model import Model
+from rtgs.methods.settings import MatteSettings, MethodSettings
+from rtgs.optics.settings import OpticsSettings
+from rtgs.scenes.scene import Scene
 from rtgs.train.method import Mode
+from rtgs.train.seeds import generator_for
+from rtgs.train.trainer import Trainer
+from tests.mesh.shapes import sphere
+
+NO_RATES = ("beta1", "beta2", "eps", "opacity_logit_limit", "smallest_scale", "largest_scale", "decay_from", "decay_to")
+STEPS = 2000
 
 
 def violent(factor: float) -> OptimizerSettings:
     """Every learning rate times ``factor``."""
     base = OptimizerSettings()
-    rates = ("means_initial", "means_final", "sh_dc", "sh_rest", "opacity_logits", "log_scales", "quaternions")
+    rates = [field.name for field in fields(base) if field.name not in NO_RATES]
     return replace(base, **{name: factor * getattr(base, name) for name in rates})
 
 
-@pytest.mark.parametrize("name", ["2dgs", "3dgs", "rtgs"])
-def test_2000_steps_at_30_times_the_learning_rates_on_noise_stay_finite(name: str):
-    settings = replace(small_method(name), optimizer=violent(30))
+def noise(*, masked: bool) -> Scene:
+    """Noise before which stands a sphere of glass."""
     scene = small_scene(noise=True, normals=True, points=150)
-    schedule = small_schedule(2000, densify_from=100, densify_until=1500, densify_every=100, opacity_reset_every=500)
-    trainer = small_trainer(scene, settings, schedule)
-    trainer.run()  # the guard stops at any non-finite loss or gradient
-    base = trainer.method.sets[0]
-    assert len(base) > 0
-    for key, tensor in base.gaussians.items():
-        assert bool(torch.isfinite(tensor).all()), key
-    limits = settings.optimizer
-    assert float(base.gaussians.opacity_logits.detach().abs().max()) <= limits.opacity_logit_limit + 1e-5
-    scales = base.gaussians.log_scales.detach().exp()
-    assert float(scales.max()) <= limits.largest_scale * scene.extent * 1.001
-    assert float(scales.min()) >= limits.smallest_scale * scene.extent * 0.999
+    if not masked:
+        return scene
+    rows, columns = torch.meshgrid(torch.arange(30), torch.arange(40), indexing="ij")
+    disc = ((rows - 14.5).square() + (columns - 19.5).square()).sqrt() < 11
+    return replace(scene, train=tuple(replace(view, mask=disc) for view in scene.train))
+
+
+def method_of(name: str) -> MethodSettings:
+    """Its stages begin at 5 % and a third of the run, and none is left out."""
+    settings = replace(small_method(name), optimizer=violent(30))
+    if name in ("2dgs", "3dgs"):
+        return settings
+    reflection = replace(settings.reflection, matte=MatteSettings(probation=0.0), cells=6)
+    optics = OpticsSettings(weight="envgs") if name == "envgs" else OpticsSettings(max_gain=0.0)
+    glass = replace(settings.transmittance, opaque_share=1.0, cells=6)
+    loss = replace(settings.loss, specular=0.2, transmission_depth=0.2)
+    return replace(settings, reflection=reflection, optics=optics, transmittance=glass, loss=loss)
+
+
+def test_every_rate_is_one_of_those_that_are_raised():
+    assert violent(2).f0_logits == 2 * OptimizerSettings().f0_logits
+    plain = OptimizerSettings()
+    raised = {field.name for field in fields(plain) if getattr(violent(2), field.name) != getattr(plain, field.name)}
+    assert raised == {field.name for field in fields(plain)} - set(NO_RATES)
+    assert {"specular_logits", "roughness_logits", "f0_logits"} < raised
+
+
+@pytest.mark.parametrize("name", ["2dgs", "3dgs", "envgs", "rtgs", "rtgs_printed"])
+def test_2000_steps_at_30_times_the_learning_rates_on_noise_stay_finite(name: str):
+    """All stages of a method: glass with an interface and a bounded weight in rtgs, without either as printed."""
+    three_stages = name.startswith("rtgs")
+    settings, scene = method_of(name), noise(masked=three_stages)
+    if name == "rtgs_printed":
+        bare = replace(settings.transmittance, split=False, max_gain=None)
+        bare = replace(bare, interface=replace(bare.interface, count=0), first_surface="base")
+        settings = replace(settings, transmittance=bare)
+    plan = small_schedule(STEPS, densify_from=100, densify_until=1500, densify_every=100, opacity_reset_every=500)
+    mesh = ObjectMesh(sphere(1.0, 16), "given", voxel=0.05, flat=False) if three_stages else None
+    method = create_method(settings, scene, plan, generator_for(3, "initialise"), mesh)
+    assert isinstance(method, Model)
+    for stage in method.stages:
+        trainer = Trainer(method, scene, seed=3, stage=stage)
+        trainer.run()  # the guard stops at any non-finite loss or gradient
+    assert method.stages[-1].until == STEPS
+    assert [stage.name for stage in method.stages][1:] == ["reflection", "transmittance"][: len(method.stages) - 1]
+    assert len(method.stages) == {"2dgs": 1, "3dgs": 1, "envgs": 2}.get(name, 3)
+    assert (method.find("transmittance") is not None) == three_stages
+    for part in method.sets:
+        _within_limits(part.gaussians, settings.optimizer, scene.extent, part.name)
     for view in (*scene.train, *scene.test):
         with torch.no_grad():
-            assert bool(torch.isfinite(trainer.method.render(view.camera, 2000, Mode.TRAIN).image).all())
+            assert bool(torch.isfinite(method.render(view.camera, STEPS, Mode.TRAIN).image).all())
+
+
+def _within_limits(gaussians, limits: OptimizerSettings, extent: float, name: str) -> None:
+    assert len(gaussians) > 0, name
+    for key, tensor in gaussians.items():
+        assert bool(torch.isfinite(tensor).all()), f"{name}.{key}"
+    assert float(gaussians.opacity_logits.detach().abs().max()) <= limits.opacity_logit_limit + 1e-5
+    scales = gaussians.log_scales.detach().exp()
+    assert float(scales.max()) <= limits.largest_scale * extent * 1.001
+    assert float(scales.min()) >= limits.smallest_scale * extent * 0.999

@@ -257,9 +257,10 @@ class Glass(Part):
         assert self.guide is not None
         surfaces, mask = self.guide.surfaces(frame.camera), bounding(frame.mask)
         source = "given" if frame.training else frame.options.masks or settings.test_masks
+        as_trained = frame.training or settings.test_masks == "as_trained"
         if source == "silhouette" or mask is None:  # a view without a mask shows the object all the same
             inside = surfaces.hit
-        elif frame.training:
+        elif as_trained:
             inside = mask
         else:
             inside = mask & surfaces.hit  # method.md 6.3: where the ray misses the mesh nothing is transmitted
@@ -288,7 +289,8 @@ class Glass(Part):
             rows = inside.nonzero()[:, 0]
             return self.wall.weights(reflection, cosine, rows, self.wall.walls(camera, pixels[rows]))
         optics = optics if settings.max_gain is None else replace(optics, max_gain=settings.max_gain)
-        return glass_weights(reflection, cosine, met.pixels, inside, optics, settings.max_weight if bounded else 0.0)
+        largest = settings.max_weight if bounded else 0.0
+        return glass_weights(reflection, cosine, met.pixels, inside, optics, largest, settings.weight_bound)
 
     def transmit(
         self,

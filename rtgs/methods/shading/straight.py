@@ -107,7 +107,13 @@ def glass_rays(glass: GlassPixels, index: Tensor, center: Tensor, view: Tensor) 
 
 
 def glass_weights(
-    reflection: Tensor, cosine: Tensor, pixels: SurfacePixels, inside: Tensor, optics: OpticsSettings, largest: float
+    reflection: Tensor,
+    cosine: Tensor,
+    pixels: SurfacePixels,
+    inside: Tensor,
+    optics: OpticsSettings,
+    largest: float,
+    bound: str = "clamp",
 ) -> tuple[Tensor, Tensor]:
     """w_r and w_t of P traced pixels (method.md 4.4): w_t is 0 outside the object, w_r inside at most ``largest``.
 
@@ -116,13 +122,23 @@ def glass_weights(
         cosine: (P,) n . omega_o; inside: (P,) bool.
         optics: with the S_max of the object's pixels.
         largest: 0: no bound.
+        bound: "clamp", or "smooth", whose gradient is 0 nowhere.
     """
     rows = inside.nonzero()[:, 0]
     shown = replace(pixels, roughness=pixels.roughness[rows], f0=pixels.f0.index_select(-1, rows))
     weights = pixel_weights(cosine[rows], shown, optics)
-    own = weights.reflection.clamp_max(largest) if largest > 0 else weights.reflection
+    own = weights.reflection if largest == 0 else _bounded(weights.reflection, largest, bound)
     passed = torch.zeros_like(reflection).index_copy(-1, rows, weights.transmission)
     return reflection.index_copy(-1, rows, own), passed
+
+
+def _bounded(weight: Tensor, largest: float, bound: str) -> Tensor:
+    """``weight`` at most ``largest``; smooth: w / (1 + (w / largest)^4)^(1/4), within 2 % of w up to half of it."""
+    if bound == "clamp":
+        return weight.clamp_max(largest)
+    # by the reciprocal: the fourth power of a large weight would overflow
+    inverse = weight.clamp_min(1e-6).reciprocal()
+    return (inverse.pow(4) + largest**-4).pow(-0.25)
 
 
 def depth_loss(bounce: FirstBounce, form: str, pixels: int) -> Tensor:

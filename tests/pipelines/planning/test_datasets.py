@@ -17,6 +17,7 @@ from rtgs.config.locate import choices_of, project_root
 from rtgs.config.sweep import compose_jobs
 from rtgs.core.errors import RtgsError
 from rtgs.scenes.scene import load_scene
+from rtgs.scenes.settings import CaptureError
 from tests.scenes.captures import ColmapCapture, save_image
 
 VIEW_COUNT = 9
@@ -173,8 +174,23 @@ def test_what_is_missing_is_listed_with_where_it_belongs(root, capsys):
     )
     assert f"{nu / 'popcorncup_all/colmap/sparse/0/cameras.bin'}" in lines
     assert f"{nu / 'popcorncup_all/images_1080'}/ with the photos" in lines
-    assert f"remark: without {nu / 'tall_bottle/mask_erosion'}/, no figures inside the mask" in lines
+    assert f"remark: without {nu / 'tall_bottle/mask_erosion'}/, no figures inside the mask, and methods" in "\n".join(
+        lines
+    )
     assert lines[-1] == "1 of 4 scenes are ready; with what is there: RUN='scene=nu_nerf/tall_bottle'"
+
+
+@pytest.mark.parametrize("method", ["rtgs", "rtgs_printed"])
+def test_without_its_masks_a_scene_is_refused_by_methods_that_see_through_glass(root, method):
+    """Else a row would be called by the method, and compared with the paper's, without its third stage."""
+    masks = root / "nu_nerf" / "tall_bottle" / "mask_erosion"
+    shutil.rmtree(masks)
+    words = ["scene=nu_nerf/tall_bottle", f"method={method}", "preset=smoke"]
+    with pytest.raises(CaptureError, match=f"{masks}.*{method} would train without its stage"):
+        build_graph(*compose(words))
+    for way in ("ablation=two_stages", "masks=none"):
+        assert build_graph(*compose([*words, way])).mesh is None
+    assert build_graph(*compose(["scene=nu_nerf/tall_bottle", "method=3dgs", "preset=smoke"])).training
 
 
 def test_only_the_scenes_of_a_table_are_asked_for(root, capsys):

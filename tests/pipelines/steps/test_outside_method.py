@@ -161,4 +161,4 @@ def test_an_entry_point_gives_it_a_plain_name(on_path, monkeypatch: pytest.Monke
     declared = metadata.EntryPoint("exposure", NAME, "rtgs.methods")
     monkeypatch.setattr(metadata, "entry_points", lambda group: [declared] if group == "rtgs.methods" else [])
     assert find_method("exposure").name == "exposure"
-    assert method_names() == ("2dgs", "3dgs", "envgs", "rtgs", "exposure")
+    assert method_names() == ("2dgs", "3dgs", "envgs", "rtgs", "rtgs_printed", "exposure")

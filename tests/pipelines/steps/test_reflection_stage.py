@@ -77,12 +77,15 @@ def test_the_split_sum_figure_shares_the_first_stage_and_shows_the_layers_of_bot
     }  # the store is shared with the tests above
     first, second = ([method for method in methods if method.name == "rtgs"] for methods in made.values())
     assert len(first) == 1
-    assert sorted(method.optics.weight for method in second) == ["microfacet", "split_sum"]
+    weights = sorted((method.optics.weight, method.optics.max_gain) for method in second)
+    assert weights == [("microfacet", 0.0), ("microfacet", 1.0), ("microfacet", 16.0), ("split_sum", 1.0)]
     pictures = []
-    for run in ("tiny_room-rtgs-smoke", "tiny_room-rtgs-smoke-split_sum"):
+    rows = ("gain_unbounded", "none", "gain_16", "split_sum")
+    for run in (f"tiny_room-rtgs-smoke{'' if row == 'none' else f'-{row}'}" for row in rows):
         page = (root / "runs" / run / "report.html").read_text(encoding="utf-8")
         assert all(f"Enlarge {layer}, rendered" in page for layer in ("Diffuse", "Reflection", "Roughness"))
         pictures.append(json.loads((root / "runs" / run / "metrics.json").read_text())["mean"]["psnr"])
-    assert pictures[0] != pictures[1]
+    assert len(set(pictures)) == len(rows)
     with (root / "tables" / "fig_split_sum-smoke" / "table.csv").open(encoding="utf-8") as stream:
-        assert [row["method"] for row in csv.DictReader(stream)] == ["rtgs", "rtgs, split_sum"]
+        found = [row["method"] for row in csv.DictReader(stream)]
+    assert found == ["rtgs" if row == "none" else f"rtgs, {row}" for row in rows]
