@@ -33,7 +33,7 @@ from rtgs.train.settings import ScheduleSettings
 from rtgs.workflow.fingerprint import fingerprint
 
 ABLATIONS = [name for name in choices_of("ablation") if name != "none"]
-WHOLE_MODELS = {"learned_glass", "paper_glass"}
+WHOLE_MODELS = {"no_mesh_guide", "learned_glass", "paper_glass"}
 SCENES = [name for name in choices_of("scene") if name != "capture"]
 
 
@@ -341,7 +341,7 @@ def test_a_scene_sets_no_keys_but_its_own(scene):
 
 @pytest.mark.parametrize("ablation", ABLATIONS)
 def test_an_ablation_flips_one_to_three_keys_and_says_why(ablation):
-    """Or puts a published model as a whole in the place of ours."""
+    """Or puts a published model as a whole in the place of ours, or takes away whatever reads the mesh."""
     content = ablation_file(ablation)
     why = content.pop("ablation")["why"]
     assert why.strip()
