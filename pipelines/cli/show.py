@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rtgs.core.errors import RtgsError
+from rtgs.core.names import unique_stems
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -96,19 +97,20 @@ def _scene(options: argparse.Namespace) -> Scene:
 def _measure(gaussians: Surfels | Ellipsoids, scene: Scene, options: argparse.Namespace, out: Path) -> None:
     """Test views of a capture: renders, error maps, tables."""
     from rtgs.evaluate.evaluate import TimedRender, evaluate_views, write_error_maps
-    from rtgs.evaluate.images import file_stem, to_bytes, write_png
+    from rtgs.evaluate.images import to_bytes, write_png
     from rtgs.evaluate.records import RunFacts, write_csv, write_json
 
     transform = _read_transform(options.transform)
     near = min(NEAR, NEAR_SHARE * scene.extent)
     renders: list[TimedRender] = []
+    stems = unique_stems(view.name for view in scene.test)
     for view in scene.test:
         camera = view.camera if transform is None else _moved(view.camera, *transform)
         scaled = near if transform is None else near * transform[1]
         start = time.perf_counter()
         image = _render(gaussians, camera, scaled, options)
         renders.append(TimedRender(image, time.perf_counter() - start))
-        write_png(out / "renders" / f"{file_stem(view.name)}.png", to_bytes(image))
+        write_png(out / "renders" / f"{stems[view.name]}.png", to_bytes(image))
     write_error_maps(renders, scene.test, out / "errors")
     facts = RunFacts(scene.name, options.file.name, "imported", surfels=len(gaussians))
     table = evaluate_views(renders, scene.test, facts)

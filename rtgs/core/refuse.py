@@ -11,6 +11,7 @@ import types
 import typing
 from dataclasses import fields
 from functools import cache
+from typing import Any
 
 from rtgs.core.errors import RtgsError
 
@@ -38,6 +39,30 @@ def refuse_unless(legal: bool, key: str, value: object, allowed: str) -> None:
     """
     if not legal:
         raise RtgsError(f"{key}={value} must be {allowed}")
+
+
+def shown(value: object, longest: int = 80) -> str:
+    """A value for a message, cut where it is long; nothing a file holds makes a message of megabytes."""
+    if isinstance(value, dict | list | tuple):
+        return f"a {type(value).__name__} of {len(value)}" if len(value) > 8 else _cut(_parts(value), longest)
+    if isinstance(value, int) and value.bit_length() > 200:
+        return f"a whole number of {value.bit_length()} bits"
+    return _cut(repr(value[: longest + 1]) if isinstance(value, str | bytes) else repr(value), longest)
+
+
+def _parts(value: dict[Any, Any] | list[Any] | tuple[Any, ...]) -> str:
+    """Of what is inside another list, only how much it is."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{_part(key)}: {_part(each)}" for key, each in value.items()) + "}"
+    return f"[{', '.join(_part(each) for each in value)}]"
+
+
+def _part(value: object) -> str:
+    return f"a {type(value).__name__} of {len(value)}" if isinstance(value, dict | list | tuple) else shown(value)
+
+
+def _cut(text: str, longest: int) -> str:
+    return text if len(text) <= longest else f"{text[:longest]}..."
 
 
 def refuse_below(key: str, value: float | None, least: float) -> None:

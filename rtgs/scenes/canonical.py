@@ -12,6 +12,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from rtgs.core.cameras import Camera
+from rtgs.core.names import path_inside
 from rtgs.scenes.scene import Scene, View
 from rtgs.scenes.settings import CaptureError
 from rtgs.scenes.truth import ViewTruth
@@ -113,7 +114,7 @@ def _entry(view: View, file: str) -> _ViewEntry:
 
 
 def _view(folder: Path, entry: _ViewEntry) -> View:
-    tensors: dict[str, Tensor] = load_file(folder / entry.file)
+    tensors: dict[str, Tensor] = load_file(path_inside(folder, entry.file, folder / SCENE_FILE, CaptureError))
     camera = Camera(
         torch.tensor(entry.rotation, dtype=torch.float64),
         torch.tensor(entry.translation, dtype=torch.float64),

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rtgs.core.names import path_inside
 from rtgs.scenes.settings import CaptureError
 from rtgs.scenes.undistort import Lens
 
@@ -83,8 +84,12 @@ class Capture:
 
 def existing_side_file(folder: Path, image_name: str, suffixes: Sequence[str]) -> Path | None:
     """The mask or normal file of an image: ``<image name><suffix>`` or ``<image stem><suffix>``, in the sub-folders of
-    the image name; a leading ``images``, ``images_<N>`` or ``input`` may be absent."""
-    relative = Path(image_name)
+    the image name; a leading ``images``, ``images_<N>`` or ``input`` may be absent.
+
+    Raises:
+        CaptureError: a name that leads out of the folder (:mod:`rtgs.core.names`).
+    """
+    relative = path_inside(folder, image_name, error=CaptureError).relative_to(folder)
     inner = Path(*relative.parts[1:])
     bases = (relative, inner) if re.fullmatch(r"images(_\d+)?|input|rgb", relative.parts[0]) else (relative,)
     for base in bases:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rtgs.core.names import path_inside
 from rtgs.core.recipe import canonical_json
 from rtgs.prepare.errors import PrepareError
 from rtgs.prepare.normals.adapters import NormalAdapter
@@ -105,7 +106,7 @@ def make_normals(
     predicted: list[np.ndarray] = []
     cached = 0
     for number, view in enumerate(views, start=1):
-        place = out / MAPS_DIR / f"{view.name}.npy"
+        place = path_inside(out / MAPS_DIR, f"{view.name}.npy")
         place.parent.mkdir(parents=True, exist_ok=True)
         kept = cache / f"{_key(view, digest, adapter, settings, scene)}.npy"
         cached += kept.is_file()

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from rtgs.core.names import path_inside
 from rtgs.prepare.errors import PrepareError
 from rtgs.prepare.poses.photos import PhotoSet, fitted_mask, side_file
 from rtgs.scenes.images import NORMAL_SUFFIXES, read_normals, same_aspect, unit_or_zero
@@ -66,7 +67,7 @@ def carry_masks(photos: PhotoSet, lenses: dict[str, Lens], folder: Path, target:
         if path is None:
             continue
         mask = undistort_nearest(fitted_mask(path, photo), lenses[photo.name])
-        place = target / f"{photo.name}.png"
+        place = path_inside(target, f"{photo.name}.png")
         place.parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(mask.astype(np.uint8) * 255).save(place)
         count += 1
@@ -96,7 +97,7 @@ def carry_normals(photos: PhotoSet, lenses: dict[str, Lens], folder: Path, targe
         if size != (photo.width, photo.height):
             normals = cv2.resize(normals, (photo.width, photo.height), interpolation=cv2.INTER_LINEAR)
         flat = unit_or_zero(undistort_image(normals, lenses[photo.name]))
-        place = target / f"{photo.name}.npy"
+        place = path_inside(target, f"{photo.name}.npy")
         place.parent.mkdir(parents=True, exist_ok=True)
         np.save(place, flat.astype(np.float16).astype(np.float32))
         count += 1

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageOps
 
+from rtgs.core.names import path_inside
 from rtgs.prepare.errors import PrepareError
 from rtgs.scenes.capture import Finding, existing_side_file, list_some
 from rtgs.scenes.digest import content_hash
@@ -233,7 +234,7 @@ def lay_out(
 ) -> None:
     """Fill ``target`` with upright pictures COLMAP can read, under their names; links where nothing changes."""
     for number, photo in enumerate(photos.photos, start=1):
-        place = target / photo.name
+        place = path_inside(target, photo.name)
         if not place.exists():
             place.parent.mkdir(parents=True, exist_ok=True)
             _lay_out_one(photo, place, background)
@@ -292,7 +293,7 @@ def write_ignored(photos: PhotoSet, folders: Sequence[Path], target: Path) -> in
         for path in filter(None, masks[photo.name]):
             keep &= ~fitted_mask(path, photo)
         count += bool(keep.any() and not keep.all())
-        place = target / f"{photo.name}.png"
+        place = path_inside(target, f"{photo.name}.png")
         place.parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(np.where(keep | ~keep.any(), 255, 0).astype(np.uint8)).save(place)
     return count

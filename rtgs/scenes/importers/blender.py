@@ -73,7 +73,7 @@ def _view(index: int, frame: Any, angle: float, path: Path, settings: SceneSetti
         raise CaptureError(f"{where} has no file_path or no transform_matrix")
     root = path.parent
     name = frame["file_path"].removeprefix("./")
-    image = locate_image(root, name)
+    image = locate_image(root, name, where)
     rotation, translation = world_to_camera(frame["transform_matrix"], where)
     size = size_on_disk(image)
     masks, normals = settings.masks_dir, settings.normals_dir

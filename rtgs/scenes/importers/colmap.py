@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from rtgs.core.names import path_inside, refuse_name
 from rtgs.scenes.capture import Capture, CaptureView, Finding, PointCloud, existing_side_file, list_some
 from rtgs.scenes.images import IMAGE_SUFFIXES, MASK_SUFFIXES, NORMAL_SUFFIXES, image_size
 from rtgs.scenes.settings import CaptureError, SceneSettings
@@ -68,6 +69,8 @@ def read_colmap(settings: SceneSettings, root: Path) -> Capture:
             "run COLMAP's mapper again"
         )
     lenses = {key: _lens(camera) for key, camera in model.cameras.items()}
+    for image in model.images.values():
+        refuse_name(image.name, folder, CaptureError)
     images_dir = find_images(root, settings.images_dir, [image.name for image in registered])
     views = tuple(_view(image, lenses[image.camera_id], images_dir, root, settings) for image in registered)
     unregistered = [image.name for image in model.images.values() if not image.has_pose]
@@ -131,7 +134,7 @@ def _view(image: Any, lens: Lens, images_dir: Path, root: Path, settings: SceneS
     masks, normals = settings.masks_dir, settings.normals_dir
     return CaptureView(
         name=image.name,
-        image=images_dir / image.name,
+        image=path_inside(images_dir, image.name, "the COLMAP model", CaptureError),
         rotation=matrix[:, :3],
         translation=matrix[:, 3],
         lens=lens,

@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from rtgs.core.names import path_inside
+from rtgs.core.refuse import shown
 from rtgs.scenes.capture import Capture, CaptureView, Finding, PointCloud, existing_side_file
 from rtgs.scenes.images import IMAGE_SUFFIXES, MASK_SUFFIXES, NORMAL_SUFFIXES, image_size
 from rtgs.scenes.settings import CaptureError, SceneSettings
@@ -89,9 +91,13 @@ def world_to_camera(matrix: object, where: str) -> tuple[np.ndarray, np.ndarray]
     return rotation, -rotation @ pose[:3, 3]
 
 
-def locate_image(root: Path, file_path: str) -> Path:
-    """The image of a frame; where ``file_path`` names no file, the first of the usual suffixes that does."""
-    exact = root / file_path
+def locate_image(root: Path, file_path: str, where: str) -> Path:
+    """The image of a frame; where ``file_path`` names no file, the first of the usual suffixes that does.
+
+    Raises:
+        CaptureError: a name that leaves ``root`` (:mod:`rtgs.core.names`); ``where`` says who gives it.
+    """
+    exact = path_inside(root, file_path, where, CaptureError)
     if exact.is_file():
         return exact
     for suffix in IMAGE_SUFFIXES:
@@ -118,25 +124,35 @@ def _view(index: int, frame: Any, shared: dict[str, Any], settings: SceneSetting
     where = f"{where} ({frame['file_path']})"
     root = path.parent
     name = frame["file_path"].removeprefix("./")
-    image = locate_image(root, name)
+    image = locate_image(root, name, where)
     rotation, translation = world_to_camera(frame["transform_matrix"], where)
     lens = _lens({**shared, **frame}, size_on_disk(image), where)
-    mask, normal = _side_files(frame, name, root, settings)
+    mask, normal = _side_files(frame, name, root, settings, where)
     return CaptureView(name, image, rotation, translation, lens, mask, normal, existing_truth(root, name))
 
 
 def _side_files(
-    frame: dict[str, Any], name: str, root: Path, settings: SceneSettings
+    frame: dict[str, Any], name: str, root: Path, settings: SceneSettings, where: str
 ) -> tuple[Path | None, Path | None]:
     """``mask_path`` and ``normal_file_path`` of the frame, else the files of masks_dir and normals_dir."""
     mask = normal = None
     if settings.masks_dir:
-        named = frame.get("mask_path")
-        mask = root / named if named else existing_side_file(root / settings.masks_dir, name, MASK_SUFFIXES)
+        named = _named(frame, "mask_path", root, where)
+        mask = named or existing_side_file(root / settings.masks_dir, name, MASK_SUFFIXES)
     if settings.normals_dir:
-        named = frame.get("normal_file_path")
-        normal = root / named if named else existing_side_file(root / settings.normals_dir, name, NORMAL_SUFFIXES)
+        named = _named(frame, "normal_file_path", root, where)
+        normal = named or existing_side_file(root / settings.normals_dir, name, NORMAL_SUFFIXES)
     return mask, normal
+
+
+def _named(keys: dict[str, Any], key: str, root: Path, where: str) -> Path | None:
+    """The file that a key names; None: it names none."""
+    value = keys.get(key)
+    if not value:
+        return None
+    if not isinstance(value, str):
+        raise CaptureError(f"{where}: {key}={shown(value)} is no file name")
+    return path_inside(root, value, f"{where}: {key}", CaptureError)
 
 
 def _number(keys: dict[str, Any], key: str, where: str) -> float | None:
@@ -196,12 +212,10 @@ def _distortion(keys: dict[str, Any], where: str) -> tuple[str, tuple[float, ...
 
 
 def _point_file(content: dict[str, Any], root: Path) -> Path | None:
-    named = content.get("ply_file_path")
-    if not named:
-        return None
-    if not (root / named).is_file():
-        raise CaptureError(f"point file {root / named} (ply_file_path of {TRANSFORMS_FILE}) does not exist: restore it")
-    return root / named
+    path = _named(content, "ply_file_path", root, str(root / TRANSFORMS_FILE))
+    if path is not None and not path.is_file():
+        raise CaptureError(f"point file {path} (ply_file_path of {TRANSFORMS_FILE}) does not exist: restore it")
+    return path
 
 
 def read_point_file(path: Path) -> PointCloud:
