@@ -18,7 +18,7 @@ from rtgs.scenes.capture import Capture, CaptureView, Finding, PointCloud, exist
 from rtgs.scenes.images import IMAGE_SUFFIXES, MASK_SUFFIXES, NORMAL_SUFFIXES, image_size
 from rtgs.scenes.settings import CaptureError, SceneSettings
 from rtgs.scenes.truth_files import existing_truth
-from rtgs.scenes.undistort import Lens
+from rtgs.scenes.undistort import Lens, refuse_size
 
 TRANSFORMS_FILE = "transforms.json"
 _OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0])
@@ -160,7 +160,7 @@ def _number(keys: dict[str, Any], key: str, where: str) -> float | None:
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise CaptureError(f"{where}: {key}={value!r} is no number")
+        raise CaptureError(f"{where}: {key}={shown(value)} is no number")
     return float(value)
 
 
@@ -171,6 +171,7 @@ def _lens(keys: dict[str, Any], size: tuple[int, int] | None, where: str) -> Len
         if size is None:
             return None
         width, height = size
+    refuse_size(width, height, where)
     focal_x, focal_y = _focal(keys, "x", width, where), _focal(keys, "y", height, where)
     if focal_x is None and focal_y is None:
         raise CaptureError(f"{where}: no focal length: give fl_x or camera_angle_x")
@@ -187,7 +188,19 @@ def _focal(keys: dict[str, Any], axis: str, side: float, where: str) -> float | 
     if focal is not None:
         return focal
     angle = _number(keys, f"camera_angle_{axis}", where)
-    return None if angle is None else 0.5 * side / math.tan(0.5 * angle)
+    return None if angle is None else focal_of_angle(angle, side, f"{where}: camera_angle_{axis}")
+
+
+def focal_of_angle(angle: float, side: float, where: str) -> float:
+    """Focal length in pixels of an angle of view in radians across ``side`` pixels.
+
+    Raises:
+        CaptureError: an angle no pinhole has.
+    """
+    if not 0 < angle < math.pi:
+        raise CaptureError(f"{where}={angle:g} must be an angle of view in radians between 0 and pi")
+    tangent = math.tan(0.5 * angle)
+    return 0.5 * side / tangent if tangent else math.inf  # an angle of 1e-320 has none; check_lens refuses the lens
 
 
 def _distortion(keys: dict[str, Any], where: str) -> tuple[str, tuple[float, ...]]:
