@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rtgs.core.documents import load_json
 from rtgs.core.errors import RtgsError
 from rtgs.core.names import unique_stems
 
@@ -187,10 +187,10 @@ def _read_transform(path: Path | None) -> tuple[Tensor, float] | None:
     import torch
 
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
+        values = load_json(path)
         matrix = torch.tensor(values["transform"], dtype=torch.float64)
         scale = float(values["scale"])
-    except (ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, LookupError, TypeError, RuntimeError) as error:
         raise RtgsError(f"{path} is no dataparser_transforms.json (keys transform and scale): {error}") from error
     rotation = matrix[:3, :3] if matrix.ndim == 2 and matrix.shape[0] >= 3 and matrix.shape[1] == 4 else None
     eye = torch.eye(3, dtype=torch.float64)

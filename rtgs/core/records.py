@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from rtgs.core.build import build
+from rtgs.core.documents import load_json
 from rtgs.core.errors import RtgsError
 
 T = TypeVar("T")
@@ -35,7 +36,7 @@ def read_json(path: Path, remedy: str = STORED) -> dict[str, Any]:
         RtgsError: it is missing, or holds no JSON object; names the file and the ``remedy``.
     """
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
+        values = load_json(path)
     except (OSError, ValueError) as error:
         raise damaged(path, error, remedy) from error
     if not isinstance(values, dict):

@@ -12,6 +12,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from rtgs.core.cameras import Camera
+from rtgs.core.documents import load_json
 from rtgs.core.names import path_inside
 from rtgs.scenes.scene import Scene, View
 from rtgs.scenes.settings import CaptureError
@@ -74,7 +75,7 @@ def read_scene(folder: Path) -> Scene:
     """
     folder = Path(folder)
     try:
-        content = json.loads((folder / SCENE_FILE).read_text(encoding="utf-8"))
+        content = load_json(folder / SCENE_FILE)
         version = content["version"]
         if version != FORMAT_VERSION:
             raise CaptureError(
@@ -90,7 +91,9 @@ def read_scene(folder: Path) -> Scene:
             extent=content["extent"],
             source=content["source"],
         )
-    except (OSError, json.JSONDecodeError, SafetensorError, KeyError, TypeError) as error:
+    except CaptureError:
+        raise
+    except (OSError, ValueError, SafetensorError, LookupError, TypeError, AttributeError, RuntimeError) as error:
         raise CaptureError(
             f"scene {folder} cannot be read ({error}): delete the folder and import the capture again"
         ) from error

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rtgs.core.build import build
+from rtgs.core.records import read_record
 from rtgs.prepare.masks.detect import Box
 from rtgs.scenes.capture import list_some
 
@@ -103,8 +103,12 @@ class MaskReport:
 
     @staticmethod
     def read(folder: Path) -> MaskReport:
-        """Read what :meth:`write` wrote."""
-        return build(MaskReport, json.loads((folder / REPORT_FILE).read_text(encoding="utf-8")))
+        """Read what :meth:`write` wrote.
+
+        Raises:
+            RtgsError: it is missing or damaged.
+        """
+        return read_record(MaskReport, folder / REPORT_FILE)
 
 
 @dataclass(frozen=True)

@@ -5,13 +5,13 @@ The world frame is the file's own; ``applied_transform`` has been applied to pos
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from rtgs.core.documents import DocumentError, load_json
 from rtgs.core.names import path_inside
 from rtgs.core.refuse import shown
 from rtgs.scenes.capture import Capture, CaptureView, Finding, PointCloud, existing_side_file
@@ -67,8 +67,8 @@ def read_json(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise CaptureError(f"{path} does not exist: correct the settings path and format")
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        content = load_json(path)
+    except (OSError, DocumentError) as error:
         raise CaptureError(f"{path} is not valid JSON ({error}): export the poses again") from error
     if not isinstance(content, dict):
         raise CaptureError(f"{path} must hold a JSON object, not a {type(content).__name__}")
