@@ -90,12 +90,12 @@ def _side_images(kind: str, capture: Capture, settings: SceneSettings) -> Iterat
         if not path.is_file():
             continue  # reported by capture_findings
         try:
-            pixels = read_mask(path) if masks else read_normals(path, settings.normals_frame)
+            photo = _photo_size(view)
+            pixels = read_mask(path, photo) if masks else read_normals(path, settings.normals_frame, photo)
         except CaptureError as error:
             yield Finding("error", str(error), str(path))
             continue
         size = (pixels.shape[1], pixels.shape[0])
-        photo = _photo_size(view)
         if photo and not same_aspect(size, photo):
             what = f"{kind} of {size[0]}x{size[1]} pixels for a photo of {photo[0]}x{photo[1]}"
             yield Finding("error", what, str(path), f"make the {kind} from this very photo")

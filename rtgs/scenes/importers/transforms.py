@@ -13,6 +13,7 @@ import numpy as np
 
 from rtgs.core.documents import DocumentError, load_json
 from rtgs.core.names import path_inside
+from rtgs.core.ply_header import check_ply
 from rtgs.core.refuse import shown
 from rtgs.scenes.capture import Capture, CaptureView, Finding, PointCloud, existing_side_file
 from rtgs.scenes.images import IMAGE_SUFFIXES, MASK_SUFFIXES, NORMAL_SUFFIXES, image_size
@@ -25,6 +26,7 @@ _OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0])
 _RADIAL = ("k1", "k2", "p1", "p2")
 _FISHEYE = ("k1", "k2", "k3", "k4")
 _FULL = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_FARTHEST_POINTS = 1e9  # in the units of the capture
 _POLYNOMIAL_MODELS = ("OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 
 
@@ -237,19 +239,33 @@ def read_point_file(path: Path) -> PointCloud:
     Raises:
         CaptureError: not a PLY file, or one without x y z.
     """
-    from plyfile import PlyData, PlyElementParseError, PlyHeaderParseError
+    from plyfile import PlyData, PlyParseError
 
     try:
+        check_ply(path)
         vertices = PlyData.read(str(path))["vertex"].data
-        positions = np.stack([np.asarray(vertices[axis], dtype=np.float64) for axis in "xyz"], axis=1)
-    except (PlyHeaderParseError, PlyElementParseError, KeyError, ValueError, OSError) as error:
+        positions = _float_columns(vertices, ("x", "y", "z"))
+    except (PlyParseError, LookupError, ValueError, TypeError, OSError, MemoryError, OverflowError) as error:
         raise CaptureError(f"point file {path} is no PLY file with x y z ({error}): export it again") from error
+    reach = np.abs(positions[np.isfinite(positions).all(axis=1)]).max(axis=1, initial=0)
+    if len(reach) and float(np.median(reach)) > _FARTHEST_POINTS:
+        raise CaptureError(
+            f"point file {path}: half of its points lie beyond {float(np.median(reach)):.3g}: its rows are not where "
+            "its header says; export it again"
+        )
     names = vertices.dtype.names or ()
     if not {"red", "green", "blue"} <= set(names):
         return PointCloud(positions, np.full_like(positions, 0.5), str(path))
-    raw = np.stack([np.asarray(vertices[channel]) for channel in ("red", "green", "blue")], axis=1)
-    colors = raw.astype(np.float64) / (1.0 if np.issubdtype(raw.dtype, np.floating) else 255.0)
+    try:
+        colors = _float_columns(vertices, ("red", "green", "blue"))
+    except (ValueError, TypeError) as error:
+        raise CaptureError(f"point file {path} has colours that are no numbers ({error}): export it again") from error
+    colors = colors / (1.0 if np.issubdtype(vertices["red"].dtype, np.floating) else 255.0)
     return PointCloud(positions, np.clip(colors, 0.0, 1.0), str(path))
+
+
+def _float_columns(rows: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
+    return np.stack([np.asarray(rows[name]).astype(np.float64) for name in names], axis=1)
 
 
 def _own_split(content: dict[str, Any], names: list[str], path: Path) -> dict[str, str]:
