@@ -12,5 +12,12 @@ def columns(rows: Sequence[Sequence[str]]) -> str:
 
 
 def spreadsheet_cell(value: object) -> object:
-    """A cell of a CSV file that no spreadsheet takes for a formula: text that begins like one gets an apostrophe."""
-    return f"'{value}" if isinstance(value, str) and value[:1] in ("=", "+", "-", "@", "\t", "\r") else value
+    """A cell of a CSV file that no spreadsheet takes for a formula: text that begins like one, and is no number, gets an
+    apostrophe."""
+    if not isinstance(value, str) or value[:1] not in ("=", "+", "-", "@", "\t", "\r") or not value:
+        return value
+    try:
+        float(value)
+    except ValueError:
+        return f"'{value}"
+    return value

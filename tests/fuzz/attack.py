@@ -84,7 +84,9 @@ def _limit_memory() -> None:
 
 def _child(names: list[str], inputs: range) -> None:
     """Print one line before and one after each input; SIGPROF ends the process where an input takes too long."""
-    import pycolmap
+    import tests.fuzz.readers  # noqa: F401  (Pillow before pycolmap, whose zlib it cannot use)
+
+    import pycolmap  # isort: skip
 
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL
     warm = TemporaryDirectory()
@@ -107,7 +109,7 @@ def _child(names: list[str], inputs: range) -> None:
 
 @dataclass
 class Outcome:
-    """What came of the inputs: counts by reader and ``accepted``, ``refused`` or ``failed``; a line for each failure."""
+    """What came of the inputs: by reader how many were accepted, refused, failed; a line for each failure."""
 
     counts: dict[str, Counter[str]]
     failures: list[str]

@@ -1,4 +1,4 @@
-"""Ways to damage a file: by bytes, by the numbers in it, by lines, by the structure of JSON. All from one ``Random``."""
+"""Ways to damage a file: by bytes, by its numbers, by lines, by the structure of JSON. All from one ``Random``."""
 
 from __future__ import annotations
 
