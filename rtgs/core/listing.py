@@ -12,8 +12,10 @@ def columns(rows: Sequence[Sequence[str]]) -> str:
 
 
 def spreadsheet_cell(value: object) -> object:
-    """A cell of a CSV file that no spreadsheet takes for a formula: text that begins like one, and is no number, gets an
-    apostrophe."""
+    """A cell of a CSV file that no spreadsheet takes for a formula: an apostrophe before text that begins like one.
+
+    Numbers in text stay.
+    """
     if not isinstance(value, str) or value[:1] not in ("=", "+", "-", "@", "\t", "\r") or not value:
         return value
     try:

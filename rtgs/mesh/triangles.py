@@ -153,7 +153,7 @@ def read_mesh_obj(path: Path) -> TriangleMesh:
                 faces += [(corner[0], corner[k], corner[k + 1]) for k in range(1, len(corner) - 1)]
         mesh = TriangleMesh(np.array(vertices).reshape(-1, 3), np.array(faces, np.int64).reshape(-1, 3))
     except (OSError, ValueError, IndexError, OverflowError) as error:
-        raise RtgsError(f"{path} is not a readable OBJ: {error}") from error
+        raise RtgsError(f"{path} is not a readable OBJ: {str(error)[:200]}") from error
     if len(mesh.faces) == 0:
         raise RtgsError(f"{path} holds no faces; is it a point cloud?")
     return mesh

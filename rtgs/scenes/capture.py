@@ -49,7 +49,8 @@ class CaptureView:
     @property
     def center(self) -> np.ndarray:
         """(3,) camera centre in the world frame."""
-        return -self.rotation.T @ self.translation
+        with np.errstate(over="ignore", invalid="ignore"):  # poses are judged by rtgs.scenes.findings
+            return -self.rotation.T @ self.translation
 
 
 @dataclass(frozen=True)

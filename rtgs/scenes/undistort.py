@@ -203,10 +203,11 @@ def undistortion_map(lens: Lens) -> np.ndarray:
     result = np.empty((2, target.height, target.width), dtype=np.float32)
     ray = np.ones((target.width, 3))
     ray[:, 0] = x
-    for row in range(target.height):
-        ray[:, 1] = (row + 0.5 - cy) / fy
-        result[:, row] = np.asarray(camera.img_from_cam(ray)).T - 0.5
-    bad_share = 1 - float(_valid(result, lens).mean())
+    with np.errstate(over="ignore", invalid="ignore"):  # what lies beyond float32 is not valid
+        for row in range(target.height):
+            ray[:, 1] = (row + 0.5 - cy) / fy
+            result[:, row] = np.asarray(camera.img_from_cam(ray)).T - 0.5
+        bad_share = 1 - float(_valid(result, lens).mean())
     if not bad_share <= _MAX_OUTSIDE_SHARE:
         raise CaptureError(
             f"camera {lens.model} {lens.params}: {bad_share:.1%} of the undistorted pixels fall outside the "

@@ -123,7 +123,7 @@ def _gaussians(*, text: bool) -> Callable[[Path], None]:
         if text:
             import plyfile
 
-            stored = plyfile.PlyData.read(str(folder / "a.ply"))
+            stored = plyfile.PlyData.read(str(folder / "a.ply"), mmap=False)  # it is written over
             stored.text = True
             stored.write(str(folder / "a.ply"))
 

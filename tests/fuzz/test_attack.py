@@ -14,7 +14,7 @@ from rtgs.core.ply_header import PlyHeaderError, check_ply
 from tests.fuzz.attack import attack, attempt, case
 from tests.fuzz.mutations import MUTATIONS, mutated
 from tests.fuzz.readers import READERS
-from tests.fuzz.regressions import REGRESSIONS
+from tests.fuzz.regressions import kept, kept_input
 
 INPUTS = 12  # of each reader
 
@@ -40,10 +40,9 @@ def test_an_input_is_its_number():
     assert len({str(case("transforms", number)) for number in range(20)}) > 15
 
 
-@pytest.mark.parametrize(("name", "number"), REGRESSIONS)
+@pytest.mark.parametrize(("name", "number"), kept())
 def test_inputs_that_once_failed(name, number, tmp_path):
-    files, place = REGRESSIONS[name, number]
-    assert attempt(name, files, place, tmp_path) in ("accepted", "refused")
+    assert attempt(name, *kept_input(name, number), tmp_path) in ("accepted", "refused")
 
 
 SMALL = {

@@ -89,8 +89,9 @@ def world_to_camera(matrix: object, where: str) -> tuple[np.ndarray, np.ndarray]
         raise CaptureError(f"{where}: transform_matrix holds something that is no number ({error})") from error
     if pose.shape not in ((4, 4), (3, 4)):
         raise CaptureError(f"{where}: transform_matrix has shape {pose.shape}, expected 4x4 (OpenGL camera to world)")
-    rotation = _OPENGL_TO_OPENCV @ pose[:3, :3].T
-    return rotation, -rotation @ pose[:3, 3]
+    with np.errstate(over="ignore", invalid="ignore"):  # NaN and inf are found when poses are checked
+        rotation = _OPENGL_TO_OPENCV @ pose[:3, :3].T
+        return rotation, -rotation @ pose[:3, 3]
 
 
 def locate_image(root: Path, file_path: str, where: str) -> Path:
