@@ -199,3 +199,9 @@ def test_pictures_are_turned_as_pillow_turns_them(tmp_path, orientation):
         assert read_exif(stored) == PhotoExif(orientation)
         expected = np.asarray(ImageOps.exif_transpose(stored))
         np.testing.assert_array_equal(np.asarray(turned_upright(stored, orientation)), expected)
+
+
+@pytest.mark.parametrize("value", [5, "photo_01.png", {"a": 1}, True])
+def test_splits_of_transforms_that_are_no_lists(tmp_path, value):
+    root = write_transforms(tmp_path, train_filenames=value, test_filenames=["images/photo_01.png"])
+    refused(root, "train_filenames is .*, not a list of names")

@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from rtgs.core.listing import spreadsheet_cell
-from rtgs.core.records import read_record
+from rtgs.core.records import damaged, read_record
+from rtgs.core.refuse import shown
 from rtgs.prepare.masks.detect import Box
 from rtgs.scenes.capture import list_some
 
@@ -110,7 +111,10 @@ class MaskReport:
         Raises:
             RtgsError: it is missing or damaged.
         """
-        return read_record(MaskReport, folder / REPORT_FILE)
+        report = read_record(MaskReport, folder / REPORT_FILE)
+        if report.method not in METHODS:
+            raise damaged(folder / REPORT_FILE, f"method is {shown(report.method)}")
+        return report
 
 
 @dataclass(frozen=True)

@@ -86,7 +86,9 @@ def world_to_camera(matrix: object, where: str) -> tuple[np.ndarray, np.ndarray]
     try:
         pose = np.asarray(matrix, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise CaptureError(f"{where}: transform_matrix holds something that is no number ({error})") from error
+        raise CaptureError(
+            f"{where}: transform_matrix holds something that is no number ({str(error)[:200]})"
+        ) from error
     if pose.shape not in ((4, 4), (3, 4)):
         raise CaptureError(f"{where}: transform_matrix has shape {pose.shape}, expected 4x4 (OpenGL camera to world)")
     with np.errstate(over="ignore", invalid="ignore"):  # NaN and inf are found when poses are checked
@@ -123,8 +125,8 @@ def _view(index: int, frame: Any, shared: dict[str, Any], settings: SceneSetting
     if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
         raise CaptureError(f"{where} has no file_path")
     if "transform_matrix" not in frame:
-        raise CaptureError(f"{where} ({frame['file_path']}) has no transform_matrix: export the poses again")
-    where = f"{where} ({frame['file_path']})"
+        raise CaptureError(f"{where} ({frame['file_path'][:80]}) has no transform_matrix: export the poses again")
+    where = f"{where} ({frame['file_path'][:80]})"
     root = path.parent
     name = frame["file_path"].removeprefix("./")
     image = locate_image(root, name, where)
@@ -217,7 +219,7 @@ def _distortion(keys: dict[str, Any], where: str) -> tuple[str, tuple[float, ...
         return "OPENCV_FISHEYE", values(_FISHEYE)
     if model not in _POLYNOMIAL_MODELS:
         raise CaptureError(
-            f"{where}: camera_model {keys.get('camera_model')!r} is not supported in transforms.json; "
+            f"{where}: camera_model {shown(keys.get('camera_model'))} is not supported in transforms.json; "
             "undistort the photos to PINHOLE, or import the COLMAP model instead"
         )
     full = values(_FULL)
@@ -278,7 +280,7 @@ def _own_split(content: dict[str, Any], names: list[str], path: Path) -> dict[st
         listed = [str(name).removeprefix("./") for name in content[f"{part}_filenames"]]
         unknown = sorted(set(listed) - set(names))
         if unknown:
-            raise CaptureError(f"{path}: {part}_filenames names images without a frame: {', '.join(unknown[:10])}")
+            raise CaptureError(f"{path}: {part}_filenames names images without a frame: {shown(unknown)}")
         split.update(dict.fromkeys(listed, part))
     return split
 
