@@ -277,6 +277,10 @@ def _own_split(content: dict[str, Any], names: list[str], path: Path) -> dict[st
         return {}
     split = dict.fromkeys(names, "unused")
     for part in ("train", "test"):
+        if not isinstance(content[f"{part}_filenames"], list):
+            raise CaptureError(
+                f"{path}: {part}_filenames is {shown(content[f'{part}_filenames'])}, not a list of names"
+            )
         listed = [str(name).removeprefix("./") for name in content[f"{part}_filenames"]]
         unknown = sorted(set(listed) - set(names))
         if unknown:
