@@ -251,7 +251,8 @@ def _read_vertices(path: Path) -> plyfile.PlyElement:
         raise FileNotFoundError(f"{path}: no such file")
     try:
         check_ply(path)
-        ply = plyfile.PlyData.read(str(path))
+        with np.errstate(over="ignore"):  # numbers in text beyond their type become inf, which is refused
+            ply = plyfile.PlyData.read(str(path))
     except (plyfile.PlyHeaderParseError, UnicodeDecodeError) as error:
         raise RtgsError(f"{path} is not a PLY file: {error}") from error
     except (plyfile.PlyParseError, ValueError, MemoryError, OverflowError, OSError) as error:

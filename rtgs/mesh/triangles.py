@@ -24,7 +24,8 @@ class TriangleMesh:
     colors: np.ndarray | None = None  # (V, 3) float32 in [0, 1]
 
     def __post_init__(self) -> None:
-        vertices, faces = np.asarray(self.vertices, np.float32), np.asarray(self.faces, np.int32)
+        with np.errstate(over="ignore"):  # beyond float32: inf, which is refused
+            vertices, faces = np.asarray(self.vertices, np.float32), np.asarray(self.faces, np.int32)
         if vertices.ndim != 2 or vertices.shape[1:] != (3,) or faces.ndim != 2 or faces.shape[1:] != (3,):
             raise ValueError(f"mesh takes vertices (V, 3) and faces (F, 3), got {vertices.shape} and {faces.shape}")
         if not np.isfinite(vertices).all():
@@ -72,7 +73,8 @@ def read_mesh_ply(path: Path) -> TriangleMesh:
 
     try:
         check_ply(path)
-        data = _read_ply(path)
+        with np.errstate(over="ignore"):  # numbers in text beyond their type become inf, which is refused
+            data = _read_ply(path)
     except (PlyParseError, OSError, ValueError, MemoryError, OverflowError) as error:
         raise RtgsError(f"{path} is not a readable PLY: {error}") from error
     names = {element.name for element in data.elements}

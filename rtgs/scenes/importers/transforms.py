@@ -246,7 +246,8 @@ def read_point_file(path: Path) -> PointCloud:
 
     try:
         check_ply(path)
-        vertices = PlyData.read(str(path))["vertex"].data
+        with np.errstate(over="ignore"):  # numbers in text beyond their type become inf, and those points go
+            vertices = PlyData.read(str(path))["vertex"].data
         positions = _float_columns(vertices, ("x", "y", "z"))
     except (PlyParseError, LookupError, ValueError, TypeError, OSError, MemoryError, OverflowError) as error:
         raise CaptureError(f"point file {path} is no PLY file with x y z ({error}): export it again") from error
@@ -277,11 +278,10 @@ def _own_split(content: dict[str, Any], names: list[str], path: Path) -> dict[st
         return {}
     split = dict.fromkeys(names, "unused")
     for part in ("train", "test"):
-        if not isinstance(content[f"{part}_filenames"], list):
-            raise CaptureError(
-                f"{path}: {part}_filenames is {shown(content[f'{part}_filenames'])}, not a list of names"
-            )
-        listed = [str(name).removeprefix("./") for name in content[f"{part}_filenames"]]
+        stated = content[f"{part}_filenames"]
+        if not isinstance(stated, list):
+            raise CaptureError(f"{path}: {part}_filenames is {shown(stated)}, not a list of names")
+        listed = [str(name).removeprefix("./") for name in stated]
         unknown = sorted(set(listed) - set(names))
         if unknown:
             raise CaptureError(f"{path}: {part}_filenames names images without a frame: {shown(unknown)}")
