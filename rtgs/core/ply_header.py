@@ -22,6 +22,10 @@ class PlyHeaderError(ValueError):
     """No PLY header, or one that the file has no bytes for; the message does not name the file."""
 
 
+class PlySizeError(PlyHeaderError):
+    """A header that the file has no bytes for."""
+
+
 @dataclass
 class _Element:
     """What is announced. Bytes of the properties of one row without lists, and of the counts of its lists."""
@@ -41,8 +45,8 @@ def check_ply(path: Path, *, exact: bool = True) -> None:
             header says.
 
     Raises:
-        PlyHeaderError: no header, a line or a header that is too long, a type that PLY does not have, more rows than
-            the file has bytes for.
+        PlyHeaderError: no header, a line or a header that is too long, a type that PLY does not have.
+        PlySizeError: more rows than the file has bytes for, or fewer.
         OSError: it cannot be read at all.
     """
     with path.open("rb") as file:
@@ -51,17 +55,15 @@ def check_ply(path: Path, *, exact: bool = True) -> None:
     text = form == "ascii"
     for element in elements:
         if element.count and not element.properties:
-            raise PlyHeaderError(f"element {shown(element.name)} has {element.count} rows of nothing")
+            raise PlySizeError(f"element {shown(element.name)} has {element.count} rows of nothing")
     # In text a number takes a digit and a blank; the last one may lack the blank.
     least = sum(e.count * (2 * e.properties if text else e.fixed + e.counts) for e in elements) - text
     if least > left:
         announced = ", ".join(f"{e.count} {e.name[:20]}" for e in elements[:8])
-        raise PlyHeaderError(f"it announces {announced}: at least {least} bytes, {left} are there")
+        raise PlySizeError(f"it announces {announced}: at least {least} bytes, {left} are there")
     plain = not text and not any(element.counts for element in elements)
     if exact and plain and left != least:
-        raise PlyHeaderError(
-            f"{left - least} bytes follow the {elements[0].count if elements else 0} rows it announces"
-        )
+        raise PlySizeError(f"{left - least} bytes follow the {elements[0].count if elements else 0} rows it announces")
 
 
 def _read_header(file: IO[bytes]) -> tuple[str, list[_Element]]:

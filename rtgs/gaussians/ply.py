@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from rtgs.core.errors import RtgsError
-from rtgs.core.ply_header import check_ply
+from rtgs.core.ply_header import PlyHeaderError, PlySizeError, check_ply
 from rtgs.gaussians.channels import Channel
 from rtgs.gaussians.ellipsoids import Ellipsoids
 from rtgs.gaussians.harmonics import rgb_to_sh_dc
@@ -253,12 +253,12 @@ def _read_vertices(path: Path) -> plyfile.PlyElement:
         check_ply(path)
         with np.errstate(over="ignore"):  # numbers in text beyond their type become inf, which is refused
             ply = plyfile.PlyData.read(str(path))
-    except (plyfile.PlyHeaderParseError, UnicodeDecodeError) as error:
+    except PlySizeError as error:
+        raise RtgsError(f"{path} is damaged or truncated: {error}") from error
+    except (PlyHeaderError, plyfile.PlyHeaderParseError, UnicodeDecodeError) as error:
         raise RtgsError(f"{path} is not a PLY file: {error}") from error
     except (plyfile.PlyParseError, ValueError, MemoryError, OverflowError, OSError) as error:
         raise RtgsError(f"{path} is damaged or truncated: {error}") from error
     if "vertex" not in ply:
         raise RtgsError(f"{path}: no element 'vertex'; it has {', '.join(e.name for e in ply.elements) or 'none'}")
-    if not ply["vertex"].count:
-        raise RtgsError(f"{path} holds 0 Gaussians: nothing was trained, or another file was meant")
     return ply["vertex"]

@@ -136,7 +136,10 @@ def load_scene(settings: SceneSettings) -> Scene:
     views = select_views(capture, settings)
     split = choose_split(capture, [view.name for view in views], settings)
     by_name = {view.name: view for view in views}
-    extent = camera_extent(np.array([by_name[name].center for name in split.train]).reshape(-1, 3))
+    try:
+        extent = camera_extent(np.array([by_name[name].center for name in split.train]).reshape(-1, 3))
+    except CaptureError as error:
+        raise CaptureError(f"capture {capture.root}: {error}") from error
     used = [by_name[name] for name in (*split.train, *split.test)]
     points, point_source = _scene_points(capture, settings, used, extent)
     record = CaptureRecord.read(capture.root)

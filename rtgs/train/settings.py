@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from rtgs.core.recipe import UNLESS_DEFAULT
-from rtgs.core.refuse import refuse_bad_numbers, refuse_below, refuse_unknown_words, refuse_unless
+from rtgs.core.refuse import refuse_bad_numbers, refuse_unknown_words, refuse_unless
 
 MonoNormalForm = Literal["cosine", "envgs"]
 PerceptualForm = Literal["lpips", "vgg_l1"]
@@ -76,8 +76,3 @@ class ScheduleSettings:
     means_lr_steps: int = 30_000
     evaluate_every: int = 0  # 0 = at the end only
     checkpoint_every: int = 500
-
-    def __post_init__(self) -> None:
-        # Intervals of 0 are refused where a method's plan is made of them (rtgs.train.schedule).
-        for name in ("total", "sh_from", "densify_from", "densify_until", "opacity_reset_every", "evaluate_every"):
-            refuse_below(f"schedule.{name}", getattr(self, name), 0)

@@ -14,7 +14,6 @@ from rtgs.methods.settings import ReflectionSettings, TransmittanceSettings
 from rtgs.prepare.masks.settings import DrawnSettings
 from rtgs.prepare.settings import FeatureSettings, MappingSettings, MatchingSettings, SfmSettings, VideoSettings
 from rtgs.render.settings import RenderSettings
-from rtgs.train.settings import ScheduleSettings
 
 NONSENSE = [
     (DensitySettings, "max_surfels", -1),
@@ -53,9 +52,6 @@ NONSENSE = [
     (TransmittanceSettings, "sh_degree", 9),
     (TransmittanceSettings, "max_gain", math.inf),
     (TransmittanceSettings, "opaque_share", 1.5),
-    (ScheduleSettings, "total", -1),
-    (ScheduleSettings, "densify_from", -1),
-    (ScheduleSettings, "evaluate_every", -5),
     (FeatureSettings, "peak_threshold", -1.0),
     (MatchingSettings, "min_inliers", -1),
     (MatchingSettings, "ransac_error", 0.0),

@@ -20,13 +20,6 @@ def splat(tmp_path):
     return tmp_path / "a.ply"
 
 
-def test_a_file_without_gaussians_is_refused(splat):
-    header = splat.read_bytes().partition(b"end_header\n")[0].replace(b"vertex 6", b"vertex 0")
-    splat.write_bytes(header + b"end_header\n")
-    with pytest.raises(RtgsError, match=r"a.ply holds 0 Gaussians"):
-        read_gaussians(splat)
-
-
 @pytest.mark.parametrize("count", [7, 10**12, 10**17])
 def test_forged_counts_are_refused(splat, count):
     splat.write_bytes(splat.read_bytes().replace(b"vertex 6", b"vertex %d" % count))
@@ -37,6 +30,6 @@ def test_forged_counts_are_refused(splat, count):
 def test_a_header_line_of_50_megabytes_is_not_read(splat):
     splat.write_bytes(b"ply\ncomment " + b"x" * 50_000_000)
     before = time.process_time()
-    with pytest.raises(RtgsError, match=r"a.ply is damaged or truncated: a line of its header is longer than 4096"):
+    with pytest.raises(RtgsError, match=r"a.ply is not a PLY file: a line of its header is longer than 4096"):
         read_gaussians(splat)
     assert time.process_time() - before < 5

@@ -15,7 +15,7 @@ from rtgs.core.documents import DocumentError, load_json
 from rtgs.core.names import path_inside
 from rtgs.core.ply_header import check_ply
 from rtgs.core.refuse import shown
-from rtgs.scenes.capture import Capture, CaptureView, Finding, PointCloud, existing_side_file
+from rtgs.scenes.capture import Capture, CaptureView, Finding, PointCloud, existing_side_file, list_some
 from rtgs.scenes.images import IMAGE_SUFFIXES, MASK_SUFFIXES, NORMAL_SUFFIXES, image_size
 from rtgs.scenes.settings import CaptureError, SceneSettings
 from rtgs.scenes.truth_files import existing_truth
@@ -284,7 +284,7 @@ def _own_split(content: dict[str, Any], names: list[str], path: Path) -> dict[st
         listed = [str(name).removeprefix("./") for name in stated]
         unknown = sorted(set(listed) - set(names))
         if unknown:
-            raise CaptureError(f"{path}: {part}_filenames names images without a frame: {shown(unknown)}")
+            raise CaptureError(f"{path}: {part}_filenames names images without a frame: {list_some(unknown, 10)}")
         split.update(dict.fromkeys(listed, part))
     return split
 
