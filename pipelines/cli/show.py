@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rtgs.core.documents import load_json
 from rtgs.core.errors import RtgsError
+from rtgs.core.names import unique_stems
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -36,6 +37,8 @@ def show(words: list[str]) -> int:
     from rtgs.gaussians.ply import read_gaussians
 
     gaussians = read_gaussians(options.file, skip_broken=options.skip_broken)
+    if not len(gaussians):
+        raise RtgsError(f"{options.file} holds 0 Gaussians: there is nothing to show; was another file meant?")
     kind = type(gaussians).__name__.lower()
     print(f"{options.file}: {len(gaussians):,} {kind}, SH degree {gaussians.sh_degree}")
     out = options.out or Path(f"{options.file.name.removesuffix('.ply')}-shown")
@@ -96,19 +99,20 @@ def _scene(options: argparse.Namespace) -> Scene:
 def _measure(gaussians: Surfels | Ellipsoids, scene: Scene, options: argparse.Namespace, out: Path) -> None:
     """Test views of a capture: renders, error maps, tables."""
     from rtgs.evaluate.evaluate import TimedRender, evaluate_views, write_error_maps
-    from rtgs.evaluate.images import file_stem, to_bytes, write_png
+    from rtgs.evaluate.images import to_bytes, write_png
     from rtgs.evaluate.records import RunFacts, write_csv, write_json
 
     transform = _read_transform(options.transform)
     near = min(NEAR, NEAR_SHARE * scene.extent)
     renders: list[TimedRender] = []
+    stems = unique_stems(view.name for view in scene.test)
     for view in scene.test:
         camera = view.camera if transform is None else _moved(view.camera, *transform)
         scaled = near if transform is None else near * transform[1]
         start = time.perf_counter()
         image = _render(gaussians, camera, scaled, options)
         renders.append(TimedRender(image, time.perf_counter() - start))
-        write_png(out / "renders" / f"{file_stem(view.name)}.png", to_bytes(image))
+        write_png(out / "renders" / f"{stems[view.name]}.png", to_bytes(image))
     write_error_maps(renders, scene.test, out / "errors")
     facts = RunFacts(scene.name, options.file.name, "imported", surfels=len(gaussians))
     table = evaluate_views(renders, scene.test, facts)
@@ -185,10 +189,10 @@ def _read_transform(path: Path | None) -> tuple[Tensor, float] | None:
     import torch
 
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
+        values = load_json(path)
         matrix = torch.tensor(values["transform"], dtype=torch.float64)
         scale = float(values["scale"])
-    except (ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, LookupError, TypeError, RuntimeError) as error:
         raise RtgsError(f"{path} is no dataparser_transforms.json (keys transform and scale): {error}") from error
     rotation = matrix[:3, :3] if matrix.ndim == 2 and matrix.shape[0] >= 3 and matrix.shape[1] == 4 else None
     eye = torch.eye(3, dtype=torch.float64)

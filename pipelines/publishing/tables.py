@@ -11,6 +11,7 @@ from pathlib import Path
 from pipelines.publishing.against_paper import ways_of
 from pipelines.publishing.results import evaluation_of
 from rtgs.config.schema import RunConfig
+from rtgs.core.documents import load_json
 from rtgs.evaluate.publish import PAPER_DATA, Measured, TableSpec, build_table
 from rtgs.evaluate.table_formats import write_table
 from rtgs.workflow import StepResult
@@ -67,7 +68,7 @@ def note_table_tracked(paths: Sequence[Path], place: str) -> None:
 
 def _tracked_digests(paths: Sequence[Path]) -> dict[str, dict[str, str]]:
     with suppress(OSError, ValueError):
-        known = json.loads(paths[0].with_name(_TRACKED_FILE).read_text(encoding="utf-8"))
+        known = load_json(paths[0].with_name(_TRACKED_FILE))
         if isinstance(known, dict):
             return known
     return {}

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipelines.steps.views import read_render, view_maps
+from rtgs.core.names import unique_stems
 
 if TYPE_CHECKING:
     import numpy as np
@@ -82,6 +83,7 @@ class TrainingPictures:
 
     def __init__(self, scene: Scene, folder: Path, total: int) -> None:
         self._views = fixed_views(scene)
+        self._stems = unique_stems(view.name for view in self._views)
         self._folder = folder
         self._total = total
         self._every = max(LEAST_STEPS, total // STOPS)
@@ -95,7 +97,7 @@ class TrainingPictures:
         self._folder.mkdir(parents=True, exist_ok=True)
         for view in self._views:
             for layer, pixels in layer_pixels(_rendered(method, view, step), view.camera).items():
-                name = f"{step:06d}_{_stem(view.name)}__{layer}.png"
+                name = f"{step:06d}_{self._stems[view.name]}__{layer}.png"
                 Image.fromarray(pixels).save(self._folder / name, compress_level=1)
 
 
@@ -108,12 +110,6 @@ def _rendered(method: Method, view: View, step: int) -> dict[str, Tensor]:
         options = RenderOptions(depth=True, normal="normal" in method.maps, layers=True)
         rendered = method.render(view.camera, step, Mode.EVALUATE, options, view.mask)
         return {"image": rendered.image, **view_maps(rendered)}
-
-
-def _stem(view_name: str) -> str:
-    from rtgs.evaluate.images import file_stem
-
-    return file_stem(view_name)
 
 
 def training_pictures(folder: Path) -> Iterator[LayerPicture]:
@@ -129,6 +125,8 @@ def training_pictures(folder: Path) -> Iterator[LayerPicture]:
 
 def final_pictures(scene: Scene, rendered: Path, step: int) -> Iterator[LayerPicture]:
     """The same layers of the same views from the artifact of the render step; none without test views."""
-    for view in fixed_views(scene) if scene.test else ():
+    views = fixed_views(scene) if scene.test else ()
+    stems = unique_stems(view.name for view in views)
+    for view in views:
         for layer, pixels in layer_pixels(read_render(rendered, view.name), view.camera).items():
-            yield LayerPicture(_stem(view.name), layer, step, pixels)
+            yield LayerPicture(stems[view.name], layer, step, pixels)

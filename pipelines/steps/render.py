@@ -79,16 +79,17 @@ class RenderParams:
 def render(params: RenderParams, context: StepContext) -> None:
     """Render every test view.
 
-    Writes ``images/<stem>.png`` (8 bit), ``views/<stem>.safetensors`` (float32: image (3, H, W) not clamped, depth
-    (H, W) z-depth divided by alpha in world units, normal (3, H, W) world frame where the method has one, alpha (H, W);
-    with a third stage also ``image_given_masks``; where a judge kept the plain method ``image_full``, the full one's
-    image: maps and layers are the full method's), ``coverage.safetensors`` (by view name (H, W) int16: training views
-    that show what the pixel shows) and ``render.json`` (:class:`RenderTimes`).
+    Writes ``images/<stem>.png`` (8 bit, stems of ``unique_stems``), ``views/<stem>.safetensors`` (float32: image (3,
+    H, W) not clamped, depth (H, W) z-depth divided by alpha in world units, normal (3, H, W) world frame where the
+    method has one, alpha (H, W); with a third stage also ``image_given_masks``; where a judge kept the plain method
+    ``image_full``, the full one's image: maps and layers are the full method's), ``coverage.safetensors`` (by view name
+    (H, W) int16: training views that show what the pixel shows) and ``render.json`` (:class:`RenderTimes`).
     """
     import torch
     from safetensors.torch import save_file
 
-    from rtgs.evaluate.images import file_stem, to_bytes, write_png
+    from rtgs.core.names import unique_stems
+    from rtgs.evaluate.images import to_bytes, write_png
     from rtgs.methods import Mode, RenderOptions
     from rtgs.scenes.canonical import read_scene
 
@@ -101,8 +102,9 @@ def render(params: RenderParams, context: StepContext) -> None:
     seconds: dict[str, float] = {}
     (context.out / "views").mkdir()
     surfaces: dict[str, Tensor] = {}
+    stems = unique_stems(view.name for view in scene.test)
     for view in scene.test:
-        stem = file_stem(view.name)
+        stem = stems[view.name]
         with torch.no_grad():
             start = time.perf_counter()
             rendered = method.render(view.camera, stage.until, Mode.EVALUATE, options, view.mask)

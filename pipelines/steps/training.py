@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rtgs.core.build import build
+from rtgs.core.documents import DocumentError, parse_json
 from rtgs.core.errors import RtgsError
 from rtgs.core.records import read_json, record_of, write_json
 from rtgs.methods.settings import MethodSettings
@@ -132,8 +133,8 @@ class HistoryRecorder:
         lines = self.path.read_text(encoding="utf-8").splitlines() if self.path.exists() else []
         for line in lines:
             try:
-                row = json.loads(line)
-            except json.JSONDecodeError:  # cut by a kill; what follows was recorded by the attempt after
+                row = parse_json(line)
+            except DocumentError:  # cut by a kill; what follows was recorded by the attempt after
                 continue
             rows = {step: kept for step, kept in rows.items() if step <= row["step"]}
             rows[row["step"]] = rows.get(row["step"], {}) | row
@@ -143,7 +144,7 @@ class HistoryRecorder:
 def read_history(folder: Path) -> list[dict[str, float]]:
     """Recorded metrics of a training artifact: one mapping per iteration, with its ``step``."""
     lines = (folder / HISTORY_FILE).read_text(encoding="utf-8").splitlines()
-    return [{key: value for key, value in json.loads(line).items() if value is not None} for line in lines]
+    return [{key: value for key, value in parse_json(line).items() if value is not None} for line in lines]
 
 
 def read_summary(folder: Path) -> TrainSummary:

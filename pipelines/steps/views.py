@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rtgs.core.names import stored_file
+
 if TYPE_CHECKING:
     from torch import Tensor
 
@@ -41,6 +43,4 @@ def read_render(folder: Path, view_name: str) -> dict[str, Tensor]:
     """The tensors of one rendered view."""
     from safetensors.torch import load_file
 
-    from rtgs.evaluate.images import file_stem
-
-    return load_file(folder / "views" / f"{file_stem(view_name)}.safetensors")
+    return load_file(stored_file(folder / "views", view_name, ".safetensors"))

@@ -12,7 +12,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from rtgs.core.build import build
+from rtgs.core.documents import load_json
 from rtgs.core.errors import RtgsError
+from rtgs.core.refuse import shown
 
 T = TypeVar("T")
 STORED = (
@@ -35,7 +37,7 @@ def read_json(path: Path, remedy: str = STORED) -> dict[str, Any]:
         RtgsError: it is missing, or holds no JSON object; names the file and the ``remedy``.
     """
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
+        values = load_json(path)
     except (OSError, ValueError) as error:
         raise damaged(path, error, remedy) from error
     if not isinstance(values, dict):
@@ -69,7 +71,8 @@ def record_of(cls: type[T], values: Mapping[str, Any], path: Path, remedy: str =
 
 def damaged(path: Path, why: object, remedy: str = STORED) -> RtgsError:
     """The error of a file that is not what it should be."""
-    return RtgsError(f"{path} cannot be read as a record ({why}): {remedy}")
+    text = str(why)
+    return RtgsError(f"{path} cannot be read as a record ({text[:400]}{'...' if len(text) > 400 else ''}): {remedy}")
 
 
 def _misfit(hint: Any, value: Any, where: str = "") -> str:
@@ -94,4 +97,4 @@ def _misfit(hint: Any, value: Any, where: str = "") -> str:
 
 
 def _wrong(value: object, where: str) -> str:
-    return f"{where or 'its content'} is {value!r}"
+    return f"{where or 'its content'} is {shown(value)}"

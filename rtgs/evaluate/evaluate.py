@@ -9,9 +9,10 @@ from typing import Protocol
 
 from torch import Tensor
 
+from rtgs.core.names import unique_stems
 from rtgs.evaluate.coverage import FRAMED_BY
 from rtgs.evaluate.flip import flip_map
-from rtgs.evaluate.images import ERROR_FULL_SCALE, error_map, error_scale_note, file_stem, write_png
+from rtgs.evaluate.images import ERROR_FULL_SCALE, error_map, error_scale_note, write_png
 from rtgs.evaluate.layers import GLASS_LAYERS, LayerTruth, layer_scales, layer_scores, metrics_of, why_absent
 from rtgs.evaluate.metrics import psnr, quantized, ssim
 from rtgs.evaluate.records import (
@@ -192,8 +193,9 @@ def write_error_maps(
 ) -> list[Path]:
     """One PNG per view in ``folder``; the colour scale is in each file's description and in ``scale.txt``."""
     paths = []
+    stems = unique_stems(view.name for view in views)
     for render, view in zip(renders, views, strict=True):
-        path = folder / f"{file_stem(view.name)}.png"
+        path = folder / f"{stems[view.name]}.png"
         write_png(path, error_map(render.image, view.image, full_scale), error_scale_note(full_scale))
         paths.append(path)
     folder.mkdir(parents=True, exist_ok=True)

@@ -81,8 +81,3 @@ def error_scale_note(full_scale: float = ERROR_FULL_SCALE) -> str:
         f"mean over RGB of |render - photo|, colour map {ERROR_COLORMAP}, "
         f"0 (dark) to {full_scale:g} (bright) on a [0, 1] scale, larger errors saturate"
     )
-
-
-def file_stem(view_name: str) -> str:
-    """A flat file name for a view, without suffix: ``left/0001.jpg`` becomes ``left_0001``, so no two views collide."""
-    return Path(view_name).with_suffix("").as_posix().strip("/").replace("/", "_")

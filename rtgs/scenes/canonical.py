@@ -12,6 +12,8 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from rtgs.core.cameras import Camera
+from rtgs.core.documents import load_json
+from rtgs.core.names import path_inside
 from rtgs.scenes.scene import Scene, View
 from rtgs.scenes.settings import CaptureError
 from rtgs.scenes.truth import ViewTruth
@@ -76,7 +78,7 @@ def read_scene(folder: Path) -> Scene:
     """
     folder = Path(folder)
     try:
-        content = json.loads((folder / SCENE_FILE).read_text(encoding="utf-8"))
+        content = load_json(folder / SCENE_FILE)
         version = content["version"]
         if version != FORMAT_VERSION:
             raise CaptureError(
@@ -93,7 +95,9 @@ def read_scene(folder: Path) -> Scene:
             source=content["source"],
             held=tuple(_view(folder, _ViewEntry(**entry)) for entry in content.get("held", ())),
         )
-    except (OSError, json.JSONDecodeError, SafetensorError, KeyError, TypeError) as error:
+    except CaptureError:
+        raise
+    except (OSError, ValueError, SafetensorError, LookupError, TypeError, AttributeError, RuntimeError) as error:
         raise CaptureError(
             f"scene {folder} cannot be read ({error}): delete the folder and import the capture again"
         ) from error
@@ -117,7 +121,7 @@ def _entry(view: View, file: str) -> _ViewEntry:
 
 
 def _view(folder: Path, entry: _ViewEntry) -> View:
-    tensors: dict[str, Tensor] = load_file(folder / entry.file)
+    tensors: dict[str, Tensor] = load_file(path_inside(folder, entry.file, folder / SCENE_FILE, CaptureError))
     camera = Camera(
         torch.tensor(entry.rotation, dtype=torch.float64),
         torch.tensor(entry.translation, dtype=torch.float64),

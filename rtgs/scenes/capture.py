@@ -9,8 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
+from rtgs.core.names import path_inside
 from rtgs.scenes.settings import CaptureError
 from rtgs.scenes.undistort import Lens
+
+_LONGEST_ITEM = 240  # characters of a name in a message
 
 
 @dataclass(frozen=True)
@@ -48,7 +51,8 @@ class CaptureView:
     @property
     def center(self) -> np.ndarray:
         """(3,) camera centre in the world frame."""
-        return -self.rotation.T @ self.translation
+        with np.errstate(over="ignore", invalid="ignore"):  # poses are judged by rtgs.scenes.findings
+            return -self.rotation.T @ self.translation
 
 
 @dataclass(frozen=True)
@@ -83,8 +87,12 @@ class Capture:
 
 def existing_side_file(folder: Path, image_name: str, suffixes: Sequence[str]) -> Path | None:
     """The mask or normal file of an image: ``<image name><suffix>`` or ``<image stem><suffix>``, in the sub-folders of
-    the image name; a leading ``images``, ``images_<N>`` or ``input`` may be absent."""
-    relative = Path(image_name)
+    the image name; a leading ``images``, ``images_<N>`` or ``input`` may be absent.
+
+    Raises:
+        CaptureError: a name that leads out of the folder (:mod:`rtgs.core.names`).
+    """
+    relative = path_inside(folder, image_name, error=CaptureError).relative_to(folder)
     inner = Path(*relative.parts[1:])
     bases = (relative, inner) if re.fullmatch(r"images(_\d+)?|input|rgb", relative.parts[0]) else (relative,)
     for base in bases:
@@ -96,8 +104,8 @@ def existing_side_file(folder: Path, image_name: str, suffixes: Sequence[str]) -
 
 
 def list_some(items: Iterable[object], limit: int = 20) -> str:
-    """A comma-separated list for messages; the tail is counted."""
-    items = [str(item) for item in items]
+    """A comma-separated list for messages; the tail is counted, and what is very long is cut."""
+    items = [text if len(text) <= _LONGEST_ITEM else f"{text[:_LONGEST_ITEM]}..." for text in map(str, items)]
     tail = f", and {len(items) - limit} more" if len(items) > limit else ""
     return ", ".join(items[:limit]) + tail
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from rtgs.core.documents import DocumentError, load_json
 from rtgs.scenes.capture import Capture, CaptureView, list_some
 from rtgs.scenes.settings import CaptureError, SceneSettings
 
@@ -84,8 +84,8 @@ def read_split_file(path: Path, known: list[str]) -> Split:
     if not path.is_file():
         raise CaptureError(f"split file {path} does not exist: correct scene.split_file")
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        content = load_json(path)
+    except (OSError, DocumentError) as error:
         raise CaptureError(f"split file {path} is not valid JSON ({error})") from error
     if not isinstance(content, dict) or not _is_name_list(content.get("test", [])) or "test" not in content:
         raise CaptureError(f'split file {path} must hold {{"train": [names], "test": [names]}}')

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from rtgs.core.names import path_inside
+
 TRUTH_FOLDER = "truth"
 TRUTH_MAPS = ("depth", "second_depth", "normal", "objects", "specular", "diffuse", "reflected", "transmitted")
 """The fields of :class:`rtgs.scenes.truth.ViewTruth` that every view has, one PNG each."""
@@ -25,5 +27,5 @@ def glass_files(folder: Path) -> tuple[Path, ...]:
 
 def existing_truth(root: Path, image_name: str) -> Path | None:
     """The truth folder of an image of a capture; None where there is none."""
-    folder = root / TRUTH_FOLDER / Path(image_name).with_suffix("")
+    folder = path_inside(root / TRUTH_FOLDER, image_name).with_suffix("")
     return folder if folder.is_dir() else None

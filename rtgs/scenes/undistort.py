@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from rtgs.core.refuse import shown
 from rtgs.scenes.settings import CaptureError
 
 # model -> how many leading parameters are a pinhole's; the rest is distortion that vanishes when it is zero.
@@ -21,6 +22,20 @@ _PINHOLE_PARAMETERS = {
     "SIMPLE_DIVISION": 3,
     "DIVISION": 4,
 }
+_TWO_FOCALS = {model for model, count in _PINHOLE_PARAMETERS.items() if count == 4} | {
+    "OPENCV_FISHEYE",
+    "FOV",
+    "THIN_PRISM_FISHEYE",
+    "RAD_TAN_THIN_PRISM_FISHEYE",
+    "FISHEYE",
+    "EUCM",
+}
+MAX_SIDE = 65_535
+"""Pixels; of the longest side of a photo. JPEG ends there."""
+_FOCAL_RANGE = (1e-3, 1e4)  # of a lens, in long sides of its picture; phones have 0.7, a fisheye 0.3, a telescope 100
+_CENTER_RANGE = 100.0  # sides that the principal point of a crop may be off
+ENLARGED = 8.0
+"""Times a photo may be larger than its camera says."""
 _PROBE_SIDE = 128  # pixels; long side at which a lens is tried out
 _MAX_OUTSIDE_SHARE = 0.01  # of the undistorted pixels; above it the lens parameters cannot be right
 
@@ -77,6 +92,11 @@ class Lens:
         if (width, height) == (self.width, self.height):
             return self
         scale = (width / self.width + height / self.height) / 2
+        if scale > ENLARGED:
+            raise CaptureError(
+                f"image {name} is {width}x{height} pixels, its camera {self.width}x{self.height}: copies may be up to "
+                f"{ENLARGED:g} times larger; use the images the poses were computed from"
+            )
         if abs(width - scale * self.width) > 1 or abs(height - scale * self.height) > 1:
             raise CaptureError(
                 f"image {name} is {width}x{height} pixels, its camera {self.width}x{self.height}: the aspect ratios "
@@ -86,20 +106,38 @@ class Lens:
         return self.resized(width, height)
 
 
+def refuse_size(width: float, height: float, where: str) -> None:
+    """Refuse pictures that no camera takes.
+
+    Raises:
+        CaptureError: a side that is no whole number of 1 to :data:`MAX_SIDE` pixels; ``where`` says who gives it.
+    """
+    if not all(1 <= side <= MAX_SIDE for side in (width, height)):
+        raise CaptureError(
+            f"{where}: image size {shown(width)}x{shown(height)}: sides are 1 to {MAX_SIDE} pixels; calibrate again"
+        )
+
+
 def check_lens(lens: Lens, name: str) -> str | None:
     """What is wrong with a lens, or None. ``name`` is where it comes from."""
     if not np.isfinite(lens.params).all():
         return f"camera of {name}: parameters {lens.params} hold NaN or inf"
-    if lens.width < 1 or lens.height < 1:
-        return f"camera of {name}: image size {lens.width}x{lens.height}"
+    try:
+        refuse_size(lens.width, lens.height, f"camera of {name}")
+    except CaptureError as error:
+        return str(error)
     if lens.model != "EQUIRECTANGULAR" and lens.params[0] <= 0:
         return f"camera of {name}: focal length {lens.params[0]} is not positive"
+    if not lens.is_pinhole and lens.model != "EQUIRECTANGULAR" and (wrong := _absurd(lens)):
+        return f"camera of {name}: {wrong}"
     try:
         pinhole = lens.pinhole()
     except CaptureError as error:
         return str(error)
     if min(pinhole.params[:2]) <= 0:
         return f"camera of {name}: focal lengths {pinhole.params[:2]} must be positive"
+    if wrong := _absurd(pinhole):
+        return f"camera of {name}: {wrong}"
     if not lens.is_pinhole:
         scale = min(1.0, _PROBE_SIDE / max(lens.width, lens.height))
         try:
@@ -107,6 +145,19 @@ def check_lens(lens: Lens, name: str) -> str | None:
         except CaptureError as error:
             return str(error)
     return None
+
+
+def _absurd(lens: Lens) -> str:
+    """What of focal length and principal point no lens has, before a library computes with it; empty: nothing."""
+    side = max(lens.width, lens.height)
+    count = 2 if lens.model in _TWO_FOCALS else 1
+    low, high = (share * side for share in _FOCAL_RANGE)
+    if wrong := [focal for focal in lens.params[:count] if not low <= focal <= high]:
+        return f"focal length {wrong[0]:g} is not plausible for {lens.width}x{lens.height} pixels ({low:g} to {high:g})"
+    center = lens.params[count : count + 2]
+    if any(abs(place) > _CENTER_RANGE * side for place in center):
+        return f"principal point {center} lies far from the {lens.width}x{lens.height} photo"
+    return ""
 
 
 @lru_cache(maxsize=256)
@@ -127,7 +178,7 @@ def undistorted_lens(lens: Lens) -> Lens:
     try:
         target = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
     except (RuntimeError, ValueError) as error:
-        raise CaptureError(f"camera {lens.model} {lens.params} cannot be undistorted: {error}") from error
+        raise CaptureError(f"camera {lens.model} {lens.params} cannot be undistorted: {str(error)[:200]}") from error
     params = tuple(float(p) for p in target.params)
     if target.model_name not in ("PINHOLE", "SIMPLE_PINHOLE") or not np.isfinite(params).all():
         raise CaptureError(
@@ -152,10 +203,11 @@ def undistortion_map(lens: Lens) -> np.ndarray:
     result = np.empty((2, target.height, target.width), dtype=np.float32)
     ray = np.ones((target.width, 3))
     ray[:, 0] = x
-    for row in range(target.height):
-        ray[:, 1] = (row + 0.5 - cy) / fy
-        result[:, row] = np.asarray(camera.img_from_cam(ray)).T - 0.5
-    bad_share = 1 - float(_valid(result, lens).mean())
+    with np.errstate(over="ignore", invalid="ignore"):  # what lies beyond float32 is not valid
+        for row in range(target.height):
+            ray[:, 1] = (row + 0.5 - cy) / fy
+            result[:, row] = np.asarray(camera.img_from_cam(ray)).T - 0.5
+        bad_share = 1 - float(_valid(result, lens).mean())
     if not bad_share <= _MAX_OUTSIDE_SHARE:
         raise CaptureError(
             f"camera {lens.model} {lens.params}: {bad_share:.1%} of the undistorted pixels fall outside the "
@@ -219,7 +271,9 @@ def _colmap_camera(lens: Lens) -> Any:
     try:
         camera = pycolmap.Camera(model=lens.model, width=lens.width, height=lens.height, params=list(lens.params))
     except (RuntimeError, ValueError, TypeError) as error:
-        raise CaptureError(f"camera model {lens.model!r} with parameters {lens.params}: {error}") from error
+        raise CaptureError(
+            f"camera model {shown(lens.model)} with parameters {shown(lens.params)}: {str(error)[:200]}"
+        ) from error
     if not camera.verify_params():
         raise CaptureError(f"camera model {lens.model} takes {camera.params_info}, got {len(lens.params)} numbers")
     return camera

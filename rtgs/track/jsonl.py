@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rtgs.core.documents import parse_json
 from rtgs.track.protocol import RunInfo, Scalar, Tracker, as_uint8, identity, mark_new
 
 
@@ -126,7 +127,7 @@ class JsonlTracking:
         """Whether a finished run of this fingerprint is recorded in this experiment."""
         for path in (self.root / safe_name(experiment)).glob("*/events.jsonl"):
             lines = path.read_text(encoding="utf-8").splitlines()
-            if lines and fingerprint in lines[0] and json.loads(lines[-1]).get("status") == "finished":
+            if lines and fingerprint in lines[0] and parse_json(lines[-1]).get("status") == "finished":
                 return True
         return False
 

@@ -19,6 +19,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from rtgs.core.documents import load_json, parse_json
 from rtgs.core.errors import RtgsError
 from rtgs.core.recipe import left_out_at
 from rtgs.train.settings import ScheduleSettings
@@ -139,7 +140,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
         if not part.is_file():
             raise CheckpointError(f"checkpoint {path}: {part.name} is missing; delete this folder to go on without it")
     try:
-        body = json.loads(record_path.read_text())
+        body = load_json(record_path)
         if body["format"] != FORMAT:
             raise CheckpointError(
                 f"checkpoint {path}: format {body['format']}, this version reads {FORMAT}; train again or use the "
@@ -149,7 +150,9 @@ def load_checkpoint(path: Path) -> Checkpoint:
         fields = dict(body["record"])
         fields["versions"] = tuple((name, version) for name, version in fields["versions"])
         record = CheckpointRecord(**fields)
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
+    except CheckpointError:
+        raise
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
         raise CheckpointError(
             f"checkpoint {path}: {RECORD_FILE} is damaged ({error}); delete this folder to go on without it"
         ) from error
@@ -234,7 +237,7 @@ def _differences(old: str, new: str, settings: RunSettings) -> list[str]:
         return {key: leaf for name, child in items for key, leaf in flat(child, f"{prefix}.{name}".lstrip(".")).items()}
 
     added = dict(_added_settings(settings))
-    before, after = ({**added, **flat(json.loads(text))} for text in (old, new))
+    before, after = ({**added, **flat(parse_json(text))} for text in (old, new))
     keys = [key for key in sorted(before.keys() | after.keys()) if before.get(key) != after.get(key)]
     shown = [f"{key}: {before.get(key)} then, {after.get(key)} now" for key in keys[:5]]
     return shown + ([f"and {len(keys) - 5} more"] if len(keys) > 5 else [])

@@ -11,6 +11,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from rtgs.core.documents import load_json
 from rtgs.core.version import VERSION
 from rtgs.workflow.fingerprint import file_digest
 from rtgs.workflow.step import Step
@@ -60,7 +61,7 @@ class Manifest:
     def read(folder: Path) -> Manifest | None:
         """The manifest of ``folder``, or None when there is none that reads as one."""
         try:
-            return Manifest.parse(json.loads((folder / NAME).read_text(encoding="utf-8")))
+            return Manifest.parse(load_json(folder / NAME))
         except (FileNotFoundError, NotADirectoryError, ValueError):
             return None
 

@@ -20,6 +20,7 @@ from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from rtgs.core.documents import load_json, parse_json
 from rtgs.core.errors import RtgsError
 from rtgs.workflow import manifest as manifests
 from rtgs.workflow.fingerprint import file_digest
@@ -76,7 +77,7 @@ class RemoteStore:
         except Exception as error:
             raise self._unreachable(error) from error
         try:
-            content = json.loads(text)
+            content = parse_json(text)
         except ValueError:
             content = None
         sent = content.pop("sent", "") if isinstance(content, dict) else None
@@ -111,7 +112,7 @@ class RemoteStore:
         if self.manifest(manifest.step, manifest.fingerprint) is not None:
             return False
         sent = secrets.token_hex(6)
-        content = json.loads((artifact.folder / manifests.NAME).read_text(encoding="utf-8")) | {"sent": sent}
+        content = load_json(artifact.folder / manifests.NAME) | {"sent": sent}
         try:
             self._fs.makedirs(folder, exist_ok=True)
             for file in manifest.files:

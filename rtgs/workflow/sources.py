@@ -12,6 +12,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from rtgs.core.documents import load_json
 from rtgs.workflow.closure import SourceTree
 from rtgs.workflow.step import StepKind
 
@@ -48,7 +49,7 @@ class SourceLock:
     @staticmethod
     def read(file: Path) -> SourceLock:
         """The recorded one; empty where there is no file."""
-        record = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
+        record = load_json(file) if file.exists() else {}
         sources = {name: line.split() for name, line in record.get("sources", {}).items()}
         return SourceLock(
             record.get("versions", {}), {name: (words[0], tuple(words[1:])) for name, words in sources.items()}

@@ -164,6 +164,14 @@ def test_error_maps_state_their_scale(tmp_path: Path) -> None:
     assert "0.25" in (tmp_path / "errors" / "scale.txt").read_text()
 
 
+def test_error_maps_of_views_whose_stems_meet_are_apart(tmp_path: Path) -> None:
+    renders, photos = capture()
+    photos = [replace(photo, name=name) for photo, name in zip(photos, ("s/t.jpg", "s_t.jpg", "s_t.png"))]
+    paths = write_error_maps(renders, photos, tmp_path / "errors")
+    assert len({path.name.lower() for path in paths}) == 3
+    assert all(path.is_file() for path in paths)
+
+
 def test_error_map_is_dark_at_zero_and_saturates() -> None:
     target = torch.zeros(3, 4, 4)
     image = target.clone()

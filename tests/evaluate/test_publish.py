@@ -223,3 +223,15 @@ def test_seconds_of_training_have_the_mesh_it_waited_for():
     seconds = {method: cell.values["train_seconds"] for (method, _), cell in table.cells.items()}
     assert {method: value and value.mean for method, value in seconds.items()} == {"rtgs": 72.0, "2dgs": 60.0}
     assert "training s, mesh included" in markdown(table)
+
+
+def test_cells_are_escaped_for_latex_and_for_spreadsheets():
+    spec = TableSpec("t", "A $10^3 ~ {x}_1 & #2 \\write18{rm} 100 %", "own")
+    table = build_table(spec, [run("=cmd|'/c calc'!A1", "@sum{a}", 25.0)])
+    text = latex(table)
+    assert r"A \$10\textasciicircum{}3 \textasciitilde{} \{x\}\_1 \& \#2 \textbackslash{}write18\{rm\} 100 \%" in text
+    assert r"@sum\{a\}" in text
+    row = next(csv.DictReader(io.StringIO(comma_separated(table))))
+    assert row["method"] == "'=cmd|'/c calc'!A1"
+    assert row["scene"] == "'@sum{a}"
+    assert float(row["psnr"]) == 25.0

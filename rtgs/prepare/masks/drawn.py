@@ -13,7 +13,6 @@ cutouts:                     # anything else: its outline, a box around it, or a
 from __future__ import annotations
 
 import difflib
-import json
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -22,6 +21,8 @@ from typing import Any
 
 import numpy as np
 
+from rtgs.core.documents import DocumentError, load_json, load_yaml
+from rtgs.core.refuse import shown
 from rtgs.prepare.errors import PrepareError
 from rtgs.scenes.capture import list_some
 
@@ -68,17 +69,17 @@ def read_drawing(path: Path, views: Iterable[str]) -> Drawing:
     content = _parse(path)
     units = content.get("units", "pixels")
     if units not in UNITS:
-        raise PrepareError(f"{path}: units={units!r} is unknown: choose one of {', '.join(UNITS)}")
+        raise PrepareError(f"{path}: units={shown(units)} is unknown: choose one of {', '.join(UNITS)}")
     names = tuple(views)
     panes = {
         str(pane): {
-            _photo(path, photo, names): _points(path, f"pane {pane}, {photo}", corners, least=3)
-            for photo, corners in _mapping(path, f"panes.{pane}", photos).items()
+            _photo(path, photo, names): _points(path, f"pane {str(pane)[:80]}, {str(photo)[:80]}", corners, least=3)
+            for photo, corners in _mapping(path, f"panes.{str(pane)[:80]}", photos).items()
         }
         for pane, photos in _mapping(path, "panes", content.get("panes") or {}).items()
     }
     cutouts = {
-        _photo(path, photo, names): _cutout(path, str(photo), marks)
+        _photo(path, photo, names): _cutout(path, str(photo)[:80], marks)
         for photo, marks in _mapping(path, "cutouts", content.get("cutouts") or {}).items()
     }
     for pane, photos in panes.items():
@@ -86,8 +87,8 @@ def read_drawing(path: Path, views: Iterable[str]) -> Drawing:
         if len(counts) > 1:
             listed = list_some(f"{name}: {len(corners)}" for name, corners in sorted(photos.items()))
             raise PrepareError(
-                f"{path}: pane {pane} has different numbers of corners ({listed}): draw the same corners in the same "
-                "order in every photo; a corner outside a photo may have coordinates outside it"
+                f"{path}: pane {pane[:80]} has different numbers of corners ({listed}): draw the same corners in the "
+                "same order in every photo; a corner outside a photo may have coordinates outside it"
             )
     drawing = Drawing(path, units == "fraction", panes, cutouts)
     if not drawing.marked:
@@ -106,25 +107,22 @@ def drawn_kinds(path: Path) -> tuple[str, ...]:
 
 
 def _parse(path: Path) -> dict[str, Any]:
-    import yaml
-
     if not path.is_file():
         raise PrepareError(
             f"{path} does not exist: write the boxes, clicks or corners into it (docs/prepare.md shows how), or name "
             "it with masks.drawn.file"
         )
     try:
-        text = path.read_text(encoding="utf-8")
-        content = json.loads(text) if path.suffix.lower() == ".json" else yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError) as error:
-        raise PrepareError(f"{path} cannot be read: {' '.join(str(error).split())[:200]}") from error
+        content = load_json(path) if path.suffix.lower() == ".json" else load_yaml(path)
+    except (OSError, DocumentError) as error:
+        raise PrepareError(f"{path} cannot be read: {error}") from error
     if not isinstance(content, dict):
         raise PrepareError(f"{path} holds {type(content).__name__}, not the keys {', '.join(_KEYS)}")
     for key in content:
         if key not in _KEYS:
             close = difflib.get_close_matches(str(key), _KEYS, n=1)
             hint = f"; did you mean {close[0]}?" if close else ""
-            raise PrepareError(f"{path}: unknown key {key!r}: give {', '.join(_KEYS)}{hint}")
+            raise PrepareError(f"{path}: unknown key {shown(key)}: give {', '.join(_KEYS)}{hint}")
     return content
 
 
@@ -144,17 +142,17 @@ def _photo(path: Path, named: object, views: tuple[str, ...]) -> str:
     if len(fitting) == 1:
         return fitting[0]
     if fitting:
-        raise PrepareError(f"{path}: {text} could be any of {list_some(fitting, 4)}: name it with its sub-folder")
+        raise PrepareError(f"{path}: {text[:80]} could be any of {list_some(fitting, 4)}: name it with its sub-folder")
     close = difflib.get_close_matches(text, views, n=1)
     hint = f"did you mean {close[0]}?" if close else f"there are {list_some(views, 4)}"
-    raise PrepareError(f"{path}: no photo {text} with a pose in the capture; {hint}")
+    raise PrepareError(f"{path}: no photo {text[:80]} with a pose in the capture; {hint}")
 
 
 def _points(path: Path, where: str, value: object, least: int = 0) -> np.ndarray:
     try:
         points = np.asarray(value if value is not None else [], dtype=np.float64).reshape(-1, 2)
     except (TypeError, ValueError) as error:
-        raise PrepareError(f"{path}: {where} is {value!r}, not a list of [x, y]") from error
+        raise PrepareError(f"{path}: {where} is {shown(value)}, not a list of [x, y]") from error
     if len(points) < least or not np.isfinite(points).all():
         raise PrepareError(f"{path}: {where} has {len(points)} corners: give at least {least} finite [x, y]")
     return points
@@ -162,7 +160,7 @@ def _points(path: Path, where: str, value: object, least: int = 0) -> np.ndarray
 
 def _cutout(path: Path, photo: str, marks: object) -> Cutout:
     if not isinstance(marks, dict) or not marks or set(marks) - set(_CUTOUT_KEYS):
-        raise PrepareError(f"{path}: cutout {photo} is {marks!r}: give outline, box, inside or outside")
+        raise PrepareError(f"{path}: cutout {photo} is {shown(marks)}: give outline, box, inside or outside")
     box = tuple(_points(path, f"the box of {photo}", marks.get("box")).reshape(-1).tolist())
     if box and not (len(box) == 4 and box[0] < box[2] and box[1] < box[3]):
         raise PrepareError(f"{path}: the box of {photo} is {list(box)}: give [left, top, right, bottom]")

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from rtgs.core.names import path_inside
 from rtgs.prepare.errors import PrepareError
 from rtgs.prepare.masks.hull import Consensus, Hull, SmallMask, find_consensus, limits, small_mask
 from rtgs.prepare.masks.maker import Made, Maker
@@ -80,8 +81,12 @@ def make_masks(request: MaskRequest, out: Path, say: Say) -> MaskReport:
 
 
 def mask_path(folder: Path, name: str) -> Path:
-    """Where the mask of a photo lies in the step's output."""
-    return folder / MASKS_DIR / f"{name}.png"
+    """Where the mask of a photo lies in the step's output.
+
+    Raises:
+        RtgsError: a name that leads out of it (:mod:`rtgs.core.names`).
+    """
+    return path_inside(folder / MASKS_DIR, f"{name}.png")
 
 
 def write_mask(inside: np.ndarray, path: Path) -> None:

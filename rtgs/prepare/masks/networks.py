@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, PngImagePlugin
 
+from rtgs.core.documents import parse_json
 from rtgs.core.recipe import canonical_json
 from rtgs.prepare.errors import PrepareError
 from rtgs.prepare.masks.detect import Box, Detector, PromptTokenizer
@@ -153,4 +154,4 @@ def _keep(inside: np.ndarray, boxes: tuple[Box, ...], path: Path) -> None:
 def _kept_boxes(path: Path) -> tuple[Box, ...]:
     with Image.open(path) as picture:
         picture.load()
-        return tuple(Box(**box) for box in json.loads(str(picture.info[_NOTE])))
+        return tuple(Box(**box) for box in parse_json(str(picture.info[_NOTE])))

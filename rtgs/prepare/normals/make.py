@@ -10,7 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
+from rtgs.core.names import path_inside
 from rtgs.core.recipe import canonical_json
+from rtgs.core.records import read_record
 from rtgs.prepare.errors import PrepareError
 from rtgs.prepare.normals.adapters import NormalAdapter
 from rtgs.prepare.normals.maps import (
@@ -53,9 +55,13 @@ class NormalReport:
 
 
 def read_message(folder: Path) -> str:
-    """In words, what :func:`make_normals` wrote into its folder."""
-    values = json.loads((folder / REPORT_FILE).read_text(encoding="utf-8"))
-    return f"{values['maps']} maps by {values['model']}; {values['message']}"
+    """In words, what :func:`make_normals` wrote into its folder.
+
+    Raises:
+        RtgsError: the file is missing or damaged.
+    """
+    report = read_record(NormalReport, folder / REPORT_FILE)
+    return f"{report.maps} maps by {report.model}; {report.message}"
 
 
 def find_network(settings: NormalSettings) -> tuple[Path, str]:
@@ -105,7 +111,7 @@ def make_normals(
     predicted: list[np.ndarray] = []
     cached = 0
     for number, view in enumerate(views, start=1):
-        place = out / MAPS_DIR / f"{view.name}.npy"
+        place = path_inside(out / MAPS_DIR, f"{view.name}.npy")
         place.parent.mkdir(parents=True, exist_ok=True)
         kept = cache / f"{_key(view, digest, adapter, settings, scene)}.npy"
         cached += kept.is_file()

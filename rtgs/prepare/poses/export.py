@@ -12,10 +12,13 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from rtgs.core.errors import RtgsError
+from rtgs.core.names import path_inside
+from rtgs.core.records import read_json, record_of
 from rtgs.prepare.errors import PrepareError
 from rtgs.prepare.poses.photos import PhotoSet, fitted_mask, side_file
 from rtgs.scenes.images import NORMAL_SUFFIXES, read_normals, same_aspect, unit_or_zero
-from rtgs.scenes.undistort import Lens, undistort_image, undistort_nearest
+from rtgs.scenes.undistort import Lens, check_lens, undistort_image, undistort_nearest
 
 MODEL_DIR = "sparse/0"
 LENSES_FILE = "lenses.json"
@@ -66,7 +69,7 @@ def carry_masks(photos: PhotoSet, lenses: dict[str, Lens], folder: Path, target:
         if path is None:
             continue
         mask = undistort_nearest(fitted_mask(path, photo), lenses[photo.name])
-        place = target / f"{photo.name}.png"
+        place = path_inside(target, f"{photo.name}.png")
         place.parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(mask.astype(np.uint8) * 255).save(place)
         count += 1
@@ -96,7 +99,7 @@ def carry_normals(photos: PhotoSet, lenses: dict[str, Lens], folder: Path, targe
         if size != (photo.width, photo.height):
             normals = cv2.resize(normals, (photo.width, photo.height), interpolation=cv2.INTER_LINEAR)
         flat = unit_or_zero(undistort_image(normals, lenses[photo.name]))
-        place = target / f"{photo.name}.npy"
+        place = path_inside(target, f"{photo.name}.npy")
         place.parent.mkdir(parents=True, exist_ok=True)
         np.save(place, flat.astype(np.float16).astype(np.float32))
         count += 1
@@ -110,12 +113,23 @@ def write_lenses(lenses: dict[str, Lens], out: Path) -> None:
 
 
 def read_lenses(folder: Path) -> dict[str, Lens]:
-    """What :func:`write_lenses` wrote; empty for a capture whose photos were not undistorted here."""
+    """What :func:`write_lenses` wrote; empty for a capture whose photos were not undistorted here.
+
+    Raises:
+        PrepareError: the file is damaged, or holds a lens that none is.
+    """
     path = folder / LENSES_FILE
     if not path.is_file():
         return {}
-    values = json.loads(path.read_text(encoding="utf-8"))
-    return {name: Lens(**{**lens, "params": tuple(lens["params"])}) for name, lens in values.items()}
+    remedy = "delete it to take marks as made on the photos as they are"
+    try:
+        lenses = {name: record_of(Lens, lens, path, remedy) for name, lens in read_json(path, remedy).items()}
+        problems = [problem for name, lens in lenses.items() if (problem := check_lens(lens, name))]
+    except RtgsError as error:
+        raise PrepareError(str(error)) from error
+    if problems:
+        raise PrepareError(f"{path}: {problems[0]}; {remedy}")
+    return lenses
 
 
 def model_lenses(images: Iterable[Any]) -> dict[str, Lens]:

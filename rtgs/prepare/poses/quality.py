@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from rtgs.core.build import build
+from rtgs.core.records import read_record
 from rtgs.prepare.poses.world import WorldChange
 from rtgs.prepare.settings import SfmSettings
 from rtgs.scenes.capture import list_some
@@ -65,13 +65,12 @@ class SfmReport:
 
     @staticmethod
     def read(folder: Path) -> SfmReport:
-        """Read what :meth:`write` wrote."""
-        values = json.loads((folder / REPORT_FILE).read_text(encoding="utf-8"))
-        world = values.pop("world")
-        rotation = tuple(tuple(row) for row in world.pop("rotation"))
-        return build(SfmReport, {**values, "world": None}).with_world(
-            WorldChange(rotation=rotation, **{**world, "translation": tuple(world["translation"])})
-        )
+        """Read what :meth:`write` wrote.
+
+        Raises:
+            RtgsError: it is missing or damaged.
+        """
+        return read_record(SfmReport, folder / REPORT_FILE)
 
     def with_world(self, world: WorldChange) -> SfmReport:
         """The same report with another change of frame."""

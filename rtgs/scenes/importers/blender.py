@@ -6,15 +6,15 @@ set (the 3DGS code does the same). ``transforms_val.json`` is not used.
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from rtgs.core.refuse import shown
 from rtgs.scenes.capture import Capture, CaptureView, Finding, existing_side_file
 from rtgs.scenes.images import MASK_SUFFIXES, NORMAL_SUFFIXES
-from rtgs.scenes.importers.transforms import locate_image, read_json, size_on_disk, world_to_camera
+from rtgs.scenes.importers.transforms import focal_of_angle, locate_image, read_json, size_on_disk, world_to_camera
 from rtgs.scenes.settings import CaptureError, SceneSettings
 from rtgs.scenes.truth_files import existing_truth
 from rtgs.scenes.undistort import Lens
@@ -59,8 +59,8 @@ def read_blender(settings: SceneSettings, root: Path) -> Capture:
 def _read_part(path: Path, settings: SceneSettings) -> list[CaptureView]:
     content = read_json(path)
     angle = content.get("camera_angle_x")
-    if isinstance(angle, bool) or not isinstance(angle, int | float) or not 0 < angle < math.pi:
-        raise CaptureError(f"{path}: camera_angle_x={angle!r} must be an angle of view in radians between 0 and pi")
+    if isinstance(angle, bool) or not isinstance(angle, int | float):
+        raise CaptureError(f"{path}: camera_angle_x={shown(angle)} must be an angle of view in radians")
     frames = content.get("frames")
     if not isinstance(frames, list) or not frames:
         raise CaptureError(f"{path} holds no frames: export the poses again")
@@ -73,7 +73,7 @@ def _view(index: int, frame: Any, angle: float, path: Path, settings: SceneSetti
         raise CaptureError(f"{where} has no file_path or no transform_matrix")
     root = path.parent
     name = frame["file_path"].removeprefix("./")
-    image = locate_image(root, name)
+    image = locate_image(root, name, where)
     rotation, translation = world_to_camera(frame["transform_matrix"], where)
     size = size_on_disk(image)
     masks, normals = settings.masks_dir, settings.normals_dir
@@ -82,14 +82,14 @@ def _view(index: int, frame: Any, angle: float, path: Path, settings: SceneSetti
         image=image,
         rotation=rotation,
         translation=np.asarray(translation),
-        lens=_lens(size, angle) if size else None,
+        lens=_lens(size, angle, f"{path}: camera_angle_x") if size else None,
         mask=existing_side_file(root / masks, name, MASK_SUFFIXES) if masks else None,
         normal=existing_side_file(root / normals, name, NORMAL_SUFFIXES) if normals else None,
         truth=existing_truth(root, name),
     )
 
 
-def _lens(size: tuple[int, int], angle: float) -> Lens:
+def _lens(size: tuple[int, int], angle: float, where: str) -> Lens:
     width, height = size
-    focal = 0.5 * width / math.tan(0.5 * angle)
+    focal = focal_of_angle(angle, width, where)
     return Lens("PINHOLE", width, height, (focal, focal, width / 2, height / 2))

@@ -9,11 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from rtgs.core.names import path_inside, refuse_name
 from rtgs.scenes.capture import Capture, CaptureView, Finding, PointCloud, existing_side_file, list_some
 from rtgs.scenes.images import IMAGE_SUFFIXES, MASK_SUFFIXES, NORMAL_SUFFIXES, image_size
+from rtgs.scenes.importers.colmap_files import DamagedModel, check_files
 from rtgs.scenes.settings import CaptureError, SceneSettings
 from rtgs.scenes.truth_files import existing_truth
-from rtgs.scenes.undistort import Lens
+from rtgs.scenes.undistort import Lens, refuse_size
 
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", ".")
 IMAGE_FOLDERS = ("images", "input", "rgb", "image")
@@ -63,11 +65,8 @@ def read_colmap(settings: SceneSettings, root: Path) -> Capture:
     model = _read_model(folder)
     registered = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
     if not registered:
-        raise CaptureError(
-            f"the COLMAP model {folder} holds no registered image: the reconstruction failed or the model is empty; "
-            "run COLMAP's mapper again"
-        )
-    lenses = {key: _lens(camera) for key, camera in model.cameras.items()}
+        raise _no_images(folder)
+    lenses = {key: _lens(camera, folder) for key, camera in model.cameras.items()}
     images_dir = find_images(root, settings.images_dir, [image.name for image in registered])
     views = tuple(_view(image, lenses[image.camera_id], images_dir, root, settings) for image in registered)
     unregistered = [image.name for image in model.images.values() if not image.has_pose]
@@ -84,10 +83,24 @@ def read_colmap(settings: SceneSettings, root: Path) -> Capture:
 
 
 def _read_model(folder: Path) -> Any:
+    """Binary files are walked first: the library trusts their counts."""
+    suffix = _model_suffix(folder)
+    if (folder / f"images{suffix}").stat().st_size == 0:
+        raise _no_images(folder)
+    if suffix == ".bin":
+        try:
+            check_files(folder)
+        except (DamagedModel, OSError) as error:
+            raise _unreadable(folder, error) from error
     import pycolmap
 
     try:
-        return pycolmap.Reconstruction(str(folder))
+        model = pycolmap.Reconstruction(str(folder))
+        for image in model.images.values():
+            refuse_name(image.name, folder, CaptureError)  # pycolmap decodes it here
+        return model
+    except CaptureError:
+        raise
     except Exception as error:  # pycolmap raises whatever its C++ side threw: RuntimeError, ValueError, IndexError
         non_finite = _non_finite_lines(folder)
         if non_finite:
@@ -95,10 +108,21 @@ def _read_model(folder: Path) -> Any:
                 f"the COLMAP model {folder} holds NaN or inf in {list_some(non_finite)}: remove these images or points "
                 "from the model, or register them again"
             ) from error
-        raise CaptureError(
-            f"the COLMAP model {folder} cannot be read ({_first_line(error)}): a file is damaged, incomplete or of "
-            "another program; export the model again"
-        ) from error
+        raise _unreadable(folder, error) from error
+
+
+def _unreadable(folder: Path, error: Exception) -> CaptureError:
+    return CaptureError(
+        f"the COLMAP model {folder} cannot be read ({_first_line(error)}): a file is damaged, incomplete or of "
+        "another program; export the model again"
+    )
+
+
+def _no_images(folder: Path) -> CaptureError:
+    return CaptureError(
+        f"the COLMAP model {folder} holds no registered image: the reconstruction failed or the model is empty; "
+        "run COLMAP's mapper again"
+    )
 
 
 def _non_finite_lines(folder: Path) -> list[str]:
@@ -121,7 +145,8 @@ def _first_line(error: Exception) -> str:
     return lines[0] if lines else type(error).__name__
 
 
-def _lens(camera: Any) -> Lens:
+def _lens(camera: Any, folder: Path) -> Lens:
+    refuse_size(camera.width, camera.height, f"the COLMAP model {folder}")
     return Lens(camera.model_name, int(camera.width), int(camera.height), tuple(float(p) for p in camera.params))
 
 
@@ -131,7 +156,7 @@ def _view(image: Any, lens: Lens, images_dir: Path, root: Path, settings: SceneS
     masks, normals = settings.masks_dir, settings.normals_dir
     return CaptureView(
         name=image.name,
-        image=images_dir / image.name,
+        image=path_inside(images_dir, image.name, "the COLMAP model", CaptureError),
         rotation=matrix[:, :3],
         translation=matrix[:, 3],
         lens=lens,

@@ -5,13 +5,16 @@ Frame: right-handed, z up, metres. Nothing here needs the renderer; see ``render
 
 from __future__ import annotations
 
-import tomllib
 from collections import Counter
 from dataclasses import MISSING, dataclass, field, fields
 from math import isfinite
 from pathlib import Path
 from types import UnionType
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+
+from rtgs.core.documents import DocumentError, load_toml
+from rtgs.core.errors import RtgsError
+from rtgs.core.refuse import shown
 
 SCENES = Path(__file__).parent / "scenes"
 REACHES = ("scenes/*.toml",)
@@ -122,7 +125,7 @@ def _build(cls: type[T], values: dict[str, Any], where: str) -> T:
     known = get_type_hints(cls)
     unknown = sorted(set(values) - set(known))
     if unknown:
-        raise ValueError(f"{where}: unknown key {unknown[0]!r}; known keys are {', '.join(sorted(known))}")
+        raise ValueError(f"{where}: unknown key {shown(unknown[0])}; known keys are {', '.join(sorted(known))}")
     for item in fields(cls):  # type: ignore[arg-type]
         if item.default is MISSING and item.default_factory is MISSING and item.name not in values:
             raise ValueError(f"{where}: the key {item.name!r} is missing")
@@ -133,7 +136,7 @@ def _build(cls: type[T], values: dict[str, Any], where: str) -> T:
     given = {key: frozen(value) for key, value in values.items()}
     for key, value in given.items():
         if not _fits(value, known[key]):
-            raise ValueError(f"{where}: {key} = {values[key]!r} does not fit, give {_in_words(known[key])}")
+            raise ValueError(f"{where}: {key} = {shown(values[key])} does not fit, give {_in_words(known[key])}")
     return cls(**given)
 
 
@@ -163,6 +166,9 @@ def _in_words(hint: Any) -> str:
     return f"a list of {len(inner)} numbers"
 
 
+_FARTHEST = 1e5  # metres
+_MOST_LIGHT = 1e6  # radiance, or times it
+_MOST_KERNELS, _MOST_VIEWS = 100_000, 10_000
 _SIZES_USED = {"box": 3, "plane": 2, "sphere": 1, "dome": 1, "knot": 1, "kernels": 1}  # the first so many of ``size``
 
 
@@ -172,12 +178,43 @@ def _check_positive(where: str, **values: float) -> None:
             raise ValueError(f"{where}: {name} = {value:g} must be more than 0")
 
 
+def _check_range(where: str, low: float, high: float, **values: float | tuple[Any, ...]) -> None:
+    """Every number, those in tuples too, lies in ``low`` to ``high``."""
+    for name, value in values.items():
+        parts = value if isinstance(value, tuple) else (value,)
+        for part in parts:
+            if isinstance(part, tuple):
+                _check_range(where, low, high, **{name: part})
+            elif not low <= part <= high:
+                raise ValueError(f"{where}: {name} = {part:g} must be {low:g} to {high:g}")
+
+
+def _check_material(material: Material, where: str) -> None:
+    _check_choice(material.kind, MATERIALS, where + ".kind")
+    _check_choice(material.texture, TEXTURES, where + ".texture")
+    _check_range(where, 0, 1, color=material.color, color2=material.color2, roughness=material.roughness)
+    _check_range(where, 1, 10, ior=material.ior)
+    _check_range(where, 0, 1e4, texture_scale=material.texture_scale)
+
+
+def _check_part(part: Part, where: str) -> None:
+    _check_choice(part.form, FORMS, where + ".form")
+    _check_range(where, -_FARTHEST, _FARTHEST, position=part.position, outline=part.outline)
+    _check_range(where, 0, _FARTHEST, size=part.size, round=part.round, blend=part.blend)
+    if part.form == "outline" and len(part.outline) < 3:
+        raise ValueError(f"{where}: an outline needs at least three (x, z) corners")
+
+
 def _check_shape(shape: Shape, where: str) -> None:
     _check_choice(shape.glow, TEXTURES, where + ", glow")
     _check_choice(shape.kind, KINDS, where + ", kind")
     for axis in range(_SIZES_USED.get(shape.kind, 0)):
         _check_positive(where, **{f"size[{axis}]": shape.size[axis]})
     _check_positive(where, count=shape.count, cell=shape.cell, arc=shape.arc, relief_size=shape.relief_size)
+    _check_range(where, -_FARTHEST, _FARTHEST, position=shape.position, copies=shape.copies, profile=shape.profile)
+    _check_range(where, 0, _FARTHEST, size=shape.size, relief=shape.relief)
+    _check_range(where, 1, _MOST_KERNELS, count=shape.count)
+    _check_range(where, 0, _MOST_LIGHT, emission=shape.emission or ())
     if shape.kind == "lathe" and len(shape.profile) < 2:
         raise ValueError(f"{where}: a lathe needs a profile of at least two (radius, height) pairs")
     if shape.kind == "sculpt" and not shape.parts:
@@ -191,6 +228,9 @@ def _check_viewpoints(viewpoints: Viewpoints, where: str) -> None:
     _check_positive(where, count=viewpoints.count, rings=viewpoints.rings, radius=nearest, field_of_view=angle)
     if angle >= 180:
         raise ValueError(f"{where}: field_of_view = {angle:g} must be below 180 degrees")
+    _check_range(where, 1, _MOST_VIEWS, count=viewpoints.count, rings=viewpoints.rings)
+    _check_range(where, -_FARTHEST, _FARTHEST, target=viewpoints.target, radius=viewpoints.radius)
+    _check_range(where, 0, 1, jitter=viewpoints.jitter)
     steepest = max(abs(elevation) for elevation in viewpoints.elevation)
     if steepest >= 90:
         raise ValueError(f"{where}: elevation = {steepest:g} must be below 90 degrees, where up has no direction")
@@ -198,38 +238,50 @@ def _check_viewpoints(viewpoints: Viewpoints, where: str) -> None:
 
 def _check_choice(value: str, allowed: tuple[str, ...], where: str) -> None:
     if value not in allowed:
-        raise ValueError(f"{where}: {value!r} is not one of {', '.join(allowed)}")
+        raise ValueError(f"{where}: {shown(value)} is not one of {', '.join(allowed)}")
 
 
 def read_description(path: Path) -> SceneDescription:
-    """Read and check one scene file. Raises ValueError naming file, shape and key."""
+    """Read and check one scene file.
+
+    Raises:
+        RtgsError: no TOML, an unknown key, a missing one, a value that does not fit; names file, shape and key.
+    """
     try:
-        with open(path, "rb") as file:
-            data = tomllib.load(file)
-    except ValueError as error:  # also bytes that are no text
-        raise ValueError(f"scene file {path} is no TOML ({error}): mend it there") from error
+        return _described(load_toml(path), path)
+    except (OSError, DocumentError) as error:
+        raise RtgsError(f"scene file {path} is no TOML ({error}): mend it there") from error
+    except ValueError as error:
+        raise RtgsError(str(error)) from error
+
+
+def _described(data: dict[str, Any], path: Path) -> SceneDescription:
     shapes = [_read_shape(values, path.name) for values in _tables(data, "shape", path.name)]
     if not shapes:
         raise ValueError(f"{path.name}: no [[shape]] in the file")
     twice = [name for name, number in Counter(shape.name for shape in shapes).items() if number > 1]
     if twice:
-        raise ValueError(f"{path.name}: more than one shape is called {twice[0]!r}, give each a name of its own")
+        raise ValueError(f"{path.name}: more than one shape is called {shown(twice[0])}, give each a name of its own")
     where = f"{path.name}, viewpoints"
     viewpoints = _build(Viewpoints, _table(data.pop("viewpoints", {}), where), where)
     _check_viewpoints(viewpoints, where)
-    return _build(
+    if reserved := sorted({"name", "shapes"} & set(data)):
+        raise ValueError(f"{path.name}: unknown key {reserved[0]!r}: a scene is called as its file is")
+    scene = _build(
         SceneDescription, {**data, "name": path.stem, "shapes": tuple(shapes), "viewpoints": viewpoints}, path.name
     )
+    _check_positive(path.name, exposure=scene.exposure)
+    _check_range(path.name, 0, _MOST_LIGHT, constant_light=scene.constant_light, exposure=scene.exposure)
+    return scene
 
 
 def _read_shape(values: dict[str, Any], file: str) -> Shape:
-    where = f"{file}, shape {values.get('name', '?')!r}"
+    where = f"{file}, shape {shown(values.get('name', '?'))}"
     material = _build(Material, _table(values.pop("material", {}), where + ", material"), where + ", material")
-    _check_choice(material.kind, MATERIALS, where + ", material.kind")
-    _check_choice(material.texture, TEXTURES, where + ", material.texture")
+    _check_material(material, where + ", material")
     parts = tuple(_build(Part, part, where + ", part") for part in _tables(values, "part", where))
     for part in parts:
-        _check_choice(part.form, FORMS, where + ", part.form")
+        _check_part(part, where + ", part")
     shape = _build(Shape, {**values, "material": material, "parts": parts}, where)
     _check_shape(shape, where)
     return shape
@@ -237,7 +289,7 @@ def _read_shape(values: dict[str, Any], file: str) -> Shape:
 
 def _table(value: Any, where: str) -> dict[str, Any]:
     if not isinstance(value, dict):
-        raise ValueError(f"{where}: {value!r} is no table of keys and values")
+        raise ValueError(f"{where}: {shown(value)} is no table of keys and values")
     return value
 
 
@@ -245,7 +297,7 @@ def _tables(data: dict[str, Any], key: str, where: str) -> list[dict[str, Any]]:
     """The tables [[key]] taken out of ``data``."""
     found = data.pop(key, [])
     if not isinstance(found, list):
-        raise ValueError(f"{where}: {key} = {found!r} is no list of tables, write [[{key}]] above each")
+        raise ValueError(f"{where}: {key} = {shown(found)} is no list of tables, write [[{key}]] above each")
     return [_table(one, f"{where}, {key}") for one in found]
 
 

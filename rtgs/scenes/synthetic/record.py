@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from rtgs.core.errors import RtgsError
+from rtgs.core.records import read_record
 from rtgs.scenes.settings import CaptureError
 from rtgs.scenes.synthetic.layers import LightLayers
 
@@ -35,8 +37,12 @@ class ViewRecord:
 
     @staticmethod
     def read(folder: Path) -> ViewRecord:
-        """Read what :meth:`write` wrote."""
-        return ViewRecord(**json.loads((folder / VIEW_RECORD).read_text(encoding="utf-8")))
+        """Read what :meth:`write` wrote.
+
+        Raises:
+            RtgsError: it is missing or damaged.
+        """
+        return read_record(ViewRecord, folder / VIEW_RECORD, "delete the folder, and the view is rendered again")
 
 
 @dataclass(frozen=True)
@@ -90,11 +96,9 @@ class CaptureRecord:
         if not path.is_file():
             return None
         try:
-            return CaptureRecord(**json.loads(path.read_text(encoding="utf-8")))
-        except (ValueError, TypeError) as error:
-            raise CaptureError(
-                f"{path} cannot be read ({error}): make the capture again, or remove the file"
-            ) from error
+            return read_record(CaptureRecord, path, "make the capture again, or remove the file")
+        except RtgsError as error:
+            raise CaptureError(str(error)) from error
 
 
 def reflected_share(layers: LightLayers, where: NDArray[np.bool_]) -> float | None:

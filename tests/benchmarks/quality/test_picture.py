@@ -15,8 +15,8 @@ from benchmarks.quality import picture
 from pipelines.publishing.results import RUN_FILE
 from pipelines.steps.evaluate import TABLE_JSON
 from rtgs.core.errors import RtgsError
+from rtgs.core.names import unique_stems
 from rtgs.evaluate.evaluate import TimedRender, evaluate_views
-from rtgs.evaluate.images import file_stem
 from rtgs.evaluate.records import RunFacts, write_json
 from rtgs.evaluate.settings import EvaluationSettings
 from rtgs.scenes.canonical import save_scene
@@ -34,11 +34,12 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]
     folders = {step: root / "store" / step / print_[:2] / print_ for step, print_ in STEPS.items()}
     (folders["render"] / "views").mkdir(parents=True)
     save_scene(scene, folders["import_scene"])
+    stems = unique_stems(view.name for view in scene.test)
     for number, view in enumerate(scene.test):
         size = view.image.shape[1:]
         maps = {"image": view.image * (0.9 - 0.1 * number), "depth": torch.rand(size) + 1, "alpha": torch.ones(size)}
         maps["normal"] = torch.nn.functional.normalize(torch.rand(3, *size), dim=0)
-        save_file(maps, folders["render"] / "views" / f"{file_stem(view.name)}.safetensors")
+        save_file(maps, folders["render"] / "views" / f"{stems[view.name]}.safetensors")
     renders = [TimedRender(view.image * (0.9 - 0.1 * number)) for number, view in enumerate(scene.test)]
     facts = RunFacts("demo", "rtgs", "smoke", steps=1, surfels=1234)
     table = evaluate_views(renders, scene.test, facts, EvaluationSettings(lpips=False))

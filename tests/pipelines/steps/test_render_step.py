@@ -57,11 +57,12 @@ class CountingMethod:
         return RenderedView(camera, image, buffers, maps=maps)
 
 
-def view(index: int, *, masked: bool) -> View:
+def view(index: int, *, masked: bool, name: str = "") -> View:
+    name = name or f"{index}.png"
     eye = torch.eye(3, dtype=torch.float64)
-    camera = Camera(eye, torch.zeros(3, dtype=torch.float64), 8.0, 8.0, 4.0, 3.0, WIDTH, HEIGHT, name=f"{index}.png")
+    camera = Camera(eye, torch.zeros(3, dtype=torch.float64), 8.0, 8.0, 4.0, 3.0, WIDTH, HEIGHT, name=name)
     mask = torch.ones(HEIGHT, WIDTH, dtype=torch.bool) if masked else None
-    return View(camera, torch.full((3, HEIGHT, WIDTH), 0.5), mask, None, f"{index}.png")
+    return View(camera, torch.full((3, HEIGHT, WIDTH), 0.5), mask, None, name)
 
 
 @pytest.fixture
@@ -124,3 +125,27 @@ def test_without_transparent_objects_given_masks_are_not_rendered(context, monke
     assert [name for name, _ in method.asked] == ["0.png", "1.png"]
     timed = render.read_timed(context.out, replace(render.RenderTimes.read(context.out)), "1.png")
     assert torch.equal(timed.image, read_render(context.out, "1.png")["image"])
+
+
+@dataclass
+class NamedMethod(CountingMethod):
+    """Shows a grey that depends on the view."""
+
+    def render(
+        self, camera: Camera, step: int, mode: Mode, options: RenderOptions, mask: torch.Tensor | None
+    ) -> RenderedView:
+        shown = super().render(camera, step, mode, options, mask)
+        return replace(shown, image=torch.full((3, HEIGHT, WIDTH), SHADES[camera.name]))
+
+
+SHADES = {"s/t.jpg": 0.25, "s_t.jpg": 0.5, "a.jpg": 0.75, "a.png": 1.0}
+
+
+def test_views_whose_stems_meet_keep_their_own_pictures(context, monkeypatch) -> None:
+    views = tuple(view(index, masked=False, name=name) for index, name in enumerate(SHADES))
+    scene = Scene("four", (view(2, masked=True),), views, torch.zeros(4, 3), torch.zeros(4, 3), 1.0, "test")
+    save_scene(scene, context.inputs["import_scene"])
+    run(context, NamedMethod(glass=False), monkeypatch, maps=False)
+    for name, shade in SHADES.items():
+        assert read_render(context.out, name)["image"].unique().tolist() == [shade]
+    assert len(list((context.out / "images").glob("*.png"))) == 4

@@ -1,5 +1,6 @@
 import pytest
 
+from rtgs.core.errors import RtgsError
 from rtgs.scenes.synthetic.description import SPECULAR, list_scenes, named_scene, read_description
 
 
@@ -112,3 +113,38 @@ def test_whole_numbers_are_numbers_and_bytes_are_no_text(tmp_path):
     path.write_bytes(b"\xff\xfe")
     with pytest.raises(ValueError, match=r"bytes\.toml is no TOML"):
         read_description(path)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("exposure = 0.0", "scene.toml: exposure = 0 must be more than 0"),
+        ("exposure = -1", "exposure = -1 must be more than 0"),
+        ("exposure = 1e300", r"exposure = 1e\+300 must be 0 to 1e\+06"),
+        ("constant_light = [-1.0, 0.0, 0.0]", "constant_light = -1 must be"),
+        ("exposure = " + "9" * 400, "exposure is a whole number of .* bits"),
+        ('name = "other"', "unknown key 'name'"),
+        ("viewpoints = { count = 1000000000 }", "count = 1e[+]09 must be 1 to 10000"),
+        ("viewpoints = { jitter = 2.0 }", "jitter = 2 must be 0 to 1"),
+        ("viewpoints = { radius = [1.0, 1e300] }", r"radius = 1e\+300"),
+    ],
+)
+def test_values_that_make_no_picture_are_refused(line, message, tmp_path):
+    with pytest.raises(RtgsError, match=message):
+        read_description(write(tmp_path, f"{line}\n{BALL}"))
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("count = 1000000000", "count = 1e[+]09 must be 1 to 100000"),
+        ("relief = -1.0", "relief = -1 must be"),
+        ("position = [1e300, 0.0, 0.0]", "position = 1e[+]300 must be"),
+        ("material = { ior = 0.0 }", "ior = 0 must be 1 to 10"),
+        ("material = { roughness = 2.0 }", "roughness = 2 must be 0 to 1"),
+        ("material = { color = [-1.0, 0.0, 0.0] }", "color = -1 must be 0 to 1"),
+    ],
+)
+def test_shapes_that_cannot_be_are_refused(line, message, tmp_path):
+    with pytest.raises(RtgsError, match=f"shape 'a'.*{message}"):
+        read_description(write(tmp_path, f"{BALL}{line}\n"))
