@@ -107,7 +107,7 @@ class Glass(Part):
 
     @property
     def groups(self) -> tuple[ParameterGroup, ...]:
-        return () if self.wall is None or self.wall.group is None else (self.wall.group,)
+        return () if self.wall is None else self.wall.groups
 
     @property
     def decisions(self) -> tuple[Decision, ...]:
@@ -304,7 +304,7 @@ class Glass(Part):
             frame.training and self._depth_loss_on(frame.step),
             frame.training and own is not None and self._watching(own, frame.step),
         )
-        wall = None if self.wall is None else FarWall(inner, surroundings, self.wall.index)
+        wall = None if self.wall is None else FarWall(inner, surroundings, self.wall.index, self.wall.tint)
         return straight.transmit(frame, rays, wall)
 
     def _own_degree(self, step: int) -> int:

@@ -28,6 +28,7 @@ class FarWall:
     inner: InnerRays | None  # None: no ray of this view is mirrored there
     surroundings: Tensor | None  # (M, 3) encoded colours that the leaving rays met
     index: Tensor | float  # of refraction
+    tint: Tensor | None = None  # (3,) of light that passes; None: none
 
 
 @torch.no_grad()
@@ -41,7 +42,7 @@ def _parts(contents: Tensor, color: Tensor, passing: Tensor, sent: Tensor, wall:
     through = passing
     if wall.inner is not None:
         none = torch.zeros(len(wall.inner.rows), 3)
-        through = far_wall(passing, none, wall.inner.rows, wall.inner.paths.cosine, wall.index)
+        through = far_wall(passing, none, wall.inner.rows, wall.inner.paths.cosine, wall.index, wall.tint)
     behind = rest * (through / sent.clamp_min(1e-9)).clamp(0, 1)
     return {"contents": own, "behind": behind, "inner": rest - behind}
 
@@ -98,8 +99,8 @@ class StraightRays:
         """(R, 3) linear light that the far wall sends on: ``passing`` light, less what it reflects, and mirrored."""
         if wall.inner is None:
             return passing
-        arriving = inner_light(wall.inner.paths, self._legs(wall), wall.index)
-        return far_wall(passing, arriving, wall.inner.rows, wall.inner.paths.cosine, wall.index)
+        arriving = inner_light(wall.inner.paths, self._legs(wall), wall.index, wall.tint)
+        return far_wall(passing, arriving, wall.inner.rows, wall.inner.paths.cosine, wall.index, wall.tint)
 
     def _legs(self, wall: FarWall) -> list[TracedLeg]:
         """What was traced along the legs inside the object: its contents, and what the leaving rays met."""

@@ -16,7 +16,7 @@ from rtgs.mesh.container import ObjectGuide
 from rtgs.mesh.inner_paths import InnerGuide, InnerPaths
 from rtgs.methods.parts.openings import Openings, judged_openings, upward_parts
 from rtgs.methods.shading.straight import GlassPixels, GlassRays
-from rtgs.optics.dielectric import wall_reflectance
+from rtgs.optics.dielectric import passed, wall_reflectance
 from rtgs.optics.settings import WallSettings
 from rtgs.train.parameters import ParameterGroup, Rate
 
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from rtgs.scenes.scene import View
 
 INDEX_LIMITS = (1.05, 2.5)
+TINT_LIMITS = (0.01, 1.0)  # below, nothing can be seen through two walls
 
 
 @dataclass(frozen=True)
@@ -45,11 +46,7 @@ class InnerRays:
 
 
 class WallLight:
-    """The walls of one object.
-
-    Attributes:
-        group: the index of refraction, where it is learned; None: it stays.
-    """
+    """The walls of one object."""
 
     def __init__(self, settings: WallSettings, guide: ObjectGuide, glass: Tensor, views: Sequence[View]) -> None:
         self.settings = settings
@@ -66,10 +63,20 @@ class WallLight:
         self._guides: dict[bytes, InnerGuide] = {}
         self._follow = settings.bounces > 0 and not guide.mesh.flat
         self._open(self._closed)
-        self.group: ParameterGroup | None = None
+        self._index: ParameterGroup | None = None
+        self._tint: ParameterGroup | None = None
+        tint = torch.tensor(settings.tint)
+        self._fixed_tint = None if bool((tint == 1).all()) else tint
         if settings.index_rate > 0:
             index = {"index": torch.tensor([settings.index])}
-            self.group = ParameterGroup("glass", index, Rate(settings.index_rate), limits=INDEX_LIMITS)
+            self._index = ParameterGroup("glass", index, Rate(settings.index_rate), limits=INDEX_LIMITS)
+        if settings.tint_rate > 0:
+            self._tint = ParameterGroup("glass_tint", {"tint": tint}, Rate(settings.tint_rate), limits=TINT_LIMITS)
+
+    @property
+    def groups(self) -> tuple[ParameterGroup, ...]:
+        """Index and tint, where they are learned."""
+        return tuple(each for each in (self._index, self._tint) if each is not None)
 
     def set_for(self, step: int | None) -> None:
         """The walls of a picture: what was judged; before that, in training (``step``), parts that may be openings are
@@ -148,7 +155,12 @@ class WallLight:
     @property
     def index(self) -> Tensor | float:
         """Of refraction: a number, or (1,) with its graph."""
-        return self.settings.index if self.group is None else self.group["index"]
+        return self.settings.index if self._index is None else self._index["index"]
+
+    @property
+    def tint(self) -> Tensor | None:
+        """(3,) of the light that passes a wall, linear; with its graph where it is learned; None: clear glass."""
+        return self._fixed_tint if self._tint is None else self._tint["tint"]
 
     def on_glass(self, glass: GlassPixels) -> GlassPixels:
         """The pixels whose first surface is known to be glass, with all of their k_s: 1 where nothing else covers
@@ -158,12 +170,17 @@ class WallLight:
         return replace(glass, flat=replace(glass.flat, specular=specular))
 
     def weights(self, reflection: Tensor, cosine: Tensor, rows: Tensor, walls: Tensor | float) -> tuple[Tensor, Tensor]:
-        """w_r and w_t of P traced pixels: R and 1 - R in ``rows``, elsewhere ``reflection`` (P,) or (3, P), and 0.
-        ``walls``: of these rows, as :meth:`walls` has them; R is 0 where there is none."""
+        """w_r and w_t of P traced pixels: R and T in ``rows``, elsewhere ``reflection`` (P,) or (3, P), and 0.
+        ``walls``: of these rows, as :meth:`walls` has them; R is 0 and T is 1 where there is none. Without a tint T is
+        1 - R in the shape of ``reflection``, with one it is (3, P)."""
         reflected = walls * wall_reflectance(cosine.index_select(0, rows), self.index)
         full = reflected.expand(*reflection.shape[:-1], -1)
-        passed = torch.zeros_like(reflection).index_copy(-1, rows, 1 - full)
-        return reflection.index_copy(-1, rows, full), passed
+        passing, none = 1 - full, torch.zeros_like(reflection)
+        if self.tint is not None:
+            walls = walls[:, None] if isinstance(walls, Tensor) else walls
+            passing = passed(reflected[:, None], walls, self.tint).T
+            none = torch.zeros(3, reflection.shape[-1])
+        return reflection.index_copy(-1, rows, full), none.index_copy(-1, rows, passing)
 
     def inner_rays(self, camera: Camera, rays: GlassRays, pixels: Tensor) -> InnerRays | None:
         """Behind the straight ``rays``, which go through these flattened ``pixels`` (R,); None: there are none."""
