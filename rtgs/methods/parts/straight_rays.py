@@ -72,17 +72,20 @@ class StraightRays:
     measured: bool
     watched: bool
 
-    def transmit(self, frame: Frame, rays: GlassRays, wall: FarWall | None = None) -> Transmission:
+    def transmit(
+        self, frame: Frame, rays: GlassRays, wall: FarWall | None = None, onward: GlassRays | None = None
+    ) -> Transmission:
         """C_t of the traced pixels: what the first bounce meets, and behind the object the second.
 
-        ``wall``: the object's far wall reflects light as well; None: it lets all pass.
+        ``wall``: the object's far wall reflects light as well; None: it lets all pass. ``onward``: the same rays behind
+        it, if they are bent there.
         """
         degree = self.base.sh_degree(frame.step)
         first, observations = self._first_bounce(rays, degree)
         assert first.colors is not None
         color, parts = first.colors, {}
         if self.settings.transmittance.second_bounce != "none" and not self.mesh.flat:
-            rows, behind = self._behind(rays, first, degree)
+            rows, behind = self._behind(rays if onward is None else onward, first, degree)
             shown = (1 - first.alpha)[:, None] if self.settings.transmittance.compositing == "over" else None
             if wall is None:
                 color = color.index_add(0, rows, behind if shown is None else shown[rows] * behind)
@@ -149,6 +152,15 @@ class StraightRays:
             second = self._trace_base(origins, directions, options).colors
         assert second is not None
         return rows, second
+
+    def beside(self, center: Tensor, directions: Tensor, degree: int) -> Tensor:
+        """(B, 3) encoded colours that the base set, its SH up to ``degree``, shows along rays (B, 3) from the camera's
+        ``center``, as if the object were not there."""
+        start = self.settings.transmittance.offset * self.base.extent
+        options = self._options(start, torch.inf, degree, False)
+        found = self._trace_base(center.expand_as(directions).contiguous(), directions, options).colors
+        assert found is not None
+        return found
 
     def _depths(self, rays: GlassRays, first: TraceBuffers) -> FirstBounce:
         """Depths of the rays that have a second surface; with ``per_hit`` also what lies behind it."""

@@ -3,8 +3,8 @@
     I_k = C_k + (1 - A_k) [ (1 - R_k) t E_k + R_k I_{k+1} ]
 
 of leg k of a path: C_k and A_k what the contents show along it, E_k the surroundings seen through the wall at its end,
-R_k the reflectance of that wall, t its tint. Contents are composited over what lies behind them in the encoding of the photos, as
-everywhere; walls mix linear light.
+R_k the reflectance of that wall, t its tint. Contents are composited over what lies behind them in the encoding of the
+photos, as everywhere; walls mix linear light.
 """
 
 from __future__ import annotations
