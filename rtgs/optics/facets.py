@@ -57,8 +57,8 @@ def visible_facets(normal: Tensor, outward: Tensor, width: float, drawn: Tensor)
     radius, angle = drawn[0].sqrt(), 2 * math.pi * drawn[1]
     x, y = radius * angle.cos(), radius * angle.sin()
     half = 0.5 * (1 + view[2])
-    y = (1 - half) * (1 - x * x).clamp_min(0).sqrt() + half * y
-    rest = (1 - x * x - y * y).clamp_min(0).sqrt()
+    y = (1 - half) * (1 - x * x).clamp_min(1e-12).sqrt() + half * y
+    rest = (1 - x * x - y * y).clamp_min(1e-12).sqrt()
     facet = x * across + y * up + rest * view
     facet = torch.stack((width * facet[0], width * facet[1], facet[2].clamp_min(1e-6)))
     facet = facet / facet.square().sum(0).sqrt()

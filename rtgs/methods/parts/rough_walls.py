@@ -1,7 +1,9 @@
 """Walls of glass that scatter a little: which ray stands for a pixel's lobe in one sample (docs/glass_light.md).
 
-A pixel's rays follow one sequence of low discrepancy (Roberts 2018), which the number of the sample walks through and
-which begins elsewhere in every pixel. In training the step is the number, so a run goes on bit for bit.
+A pixel's rays follow sequences of low discrepancy (Roberts 2018), which the number of the sample walks through and
+which begin elsewhere in every pixel: two dimensions for the mirror ray, four for the two walls that the straight ray
+passes, two for the ray that leaves after a reflection inside. In training the step is the number, so a run goes on bit
+for bit.
 """
 
 from __future__ import annotations
@@ -20,8 +22,8 @@ from rtgs.methods.shading.straight import GlassPixels, GlassRays
 from rtgs.methods.shading.traced_pixels import TracedPixels
 from rtgs.optics.facets import deviated, mirrored_at_facets
 
-_MIRROR, _NEAR, _FAR, _LEAVING = 0, 2, 4, 6  # first of the two dimensions of each draw
 _DIMENSIONS = 8
+_MIRROR, _NEAR, _FAR, _LEAVING = 0, 2, 4, 6  # first of the two dimensions of each draw
 
 
 def _growth(dimensions: int) -> Tensor:
@@ -30,6 +32,9 @@ def _growth(dimensions: int) -> Tensor:
     for _ in range(60):
         phi = (1 + phi) ** (1 / (dimensions + 1))
     return torch.tensor([phi ** -(k + 1) for k in range(dimensions)], dtype=torch.float64)
+
+
+_STRIDES = torch.cat((_growth(2), _growth(4), _growth(2)))
 
 
 def _scrambled(values: Tensor) -> Tensor:
@@ -56,7 +61,7 @@ class Scatter:
 
     def drawn(self, pixels: Tensor, first: int) -> Tensor:
         """(2, P) float32 in 0..1 of flattened ``pixels`` (P,)."""
-        strides = _growth(_DIMENSIONS)[first : first + 2]
+        strides = _STRIDES[first : first + 2]
         starts = torch.stack([_scrambled(pixels * _DIMENSIONS + first + k) for k in range(2)])
         return ((starts + self.number * strides[:, None]) % 1).float().clamp_max(1 - 2**-24)
 

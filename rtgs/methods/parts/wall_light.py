@@ -245,7 +245,8 @@ class WallLight:
         if width == 0:
             return [None]
         numbers = range(self.settings.rough_samples) if step is None else (step,)
-        return [Scatter(width, float(self.index), number) for number in numbers]
+        index = float(torch.as_tensor(self.index).detach())
+        return [Scatter(width, index, number) for number in numbers]
 
     def inner_rays(self, camera: Camera, rays: GlassRays, pixels: Tensor) -> InnerRays | None:
         """Behind the straight ``rays``, which go through these flattened ``pixels`` (R,); None: there are none."""
