@@ -85,7 +85,7 @@ def test_a_tint_of_one_is_clear_glass_and_two_walls_take_its_square(made: GlassS
     assert dark.layers is not None
     assert clear.layers is not None
     assert torch.equal(dark.layers["reflection"], clear.layers["reflection"])
-    before, after = (decoded(each.layers["behind"], "linear") for each in (clear, dark))
+    before, after = (decoded(layers["behind"], "linear") for layers in (clear.layers, dark.layers))
     for channel, expected in enumerate((0.25, 0.64, 1.0)):
         seen = before[channel] > 0.003
         assert int(seen.sum()) > 3

@@ -18,7 +18,15 @@ from rtgs.mesh.container import ObjectGuide, ObjectMesh, ObjectSurfaces
 from rtgs.mesh.silhouettes import bounding
 from rtgs.methods.parts.base import BaseSet, composited
 from rtgs.methods.parts.gaussian_set import GaussianSet, densified, opacity_reset
-from rtgs.methods.parts.glass_evidence import glass_faces, has_masks, near_surface, on_surface, seen_bare
+from rtgs.methods.parts.glass_evidence import (
+    NOT_MASKED,
+    glass_faces,
+    has_masks,
+    near_surface,
+    on_surface,
+    seen_bare,
+    why_left_out,
+)
 from rtgs.methods.parts.glass_sets import drawn_in_box, interface_set, taken_from_base, transmittance_set
 from rtgs.methods.parts.interface_set import InterfaceSet, interface_surfels
 from rtgs.methods.parts.mirror import Mirror, Reflected, stored_surfels
@@ -26,7 +34,7 @@ from rtgs.methods.parts.part import Frame, Part, Raster, Rows
 from rtgs.methods.parts.rough_walls import GlassView, Scatter, bent_rays
 from rtgs.methods.parts.straight_rays import FarWall, StraightRays
 from rtgs.methods.parts.traced_set import FollowingTree, TracedSet
-from rtgs.methods.parts.wall_light import InnerRays, WallLight
+from rtgs.methods.parts.wall_light import InnerRays, WallLight, walls_of
 from rtgs.methods.plans import transmittance_plan
 from rtgs.methods.shading.lights import Light, Traced, lit_view, mean_of_lights
 from rtgs.methods.shading.mirror import SurfacePixels, reflected_weight
@@ -58,7 +66,6 @@ if TYPE_CHECKING:
 _BEGUN = "third_stage"  # in the state: the stage has begun
 _GLASS = "glass_faces"
 _LEFT_OUT = "third_stage_left_out"  # instead of both
-NOT_MASKED = -1.0  # the stage is left out for want of masks
 
 
 class Glass(Part):
@@ -115,11 +122,7 @@ class Glass(Part):
     def decisions(self) -> tuple[Decision, ...]:
         if self._left_out is None:
             return () if self.wall is None else self.wall.decisions
-        why = "the masks of the training views are empty, or cover all of them"
-        if self._left_out != NOT_MASKED:
-            why = f"the masked object looks opaque: {self._left_out:.1%} of what its pixels show is its own surface "
-            why += "(method.transmittance.opaque_share)"
-        return (Decision("no transmittance stage", why),)
+        return (Decision("no transmittance stage", why_left_out(self._left_out)),)
 
     def mask(self, view: View) -> Tensor | None:
         """L_spec acts in masks that bound something, unless the stage was left out."""
@@ -141,23 +144,12 @@ class Glass(Part):
         self.begun = True
         mesh, settings = self.guide.mesh, self.settings.transmittance
         self._glass = glass_faces(self.guide, self._views, settings.interface.masked_share)
-        self._put_walls()
+        self.wall = walls_of(self.settings.transmittance, self.guide, self._glass, self._views)
         kept = self._seen_bare(stage.from_step)  # before the interface hides what is in the object
         if settings.interface.count > 0:
             yield self._add_interface(mesh)
         if settings.first_bounce == "transmittance":
             yield self._add_transmittance(mesh, kept)
-
-    def _put_walls(self) -> None:
-        """Walls that reflect as thin glass does, where the settings ask for them."""
-        assert self.guide is not None
-        walls = self.settings.transmittance.wall
-        transmittance = self.settings.transmittance
-        if transmittance.first_bounce != "transmittance" or transmittance.second_bounce == "none":
-            walls = replace(walls, bounces=0)  # the set that it would be followed through, or the far wall, is missing
-        samples = transmittance.rim_samples
-        own = WallLight(walls, self.guide, self._glass, self._views, samples) if walls.light == "fresnel" else None
-        self.wall = own
 
     def _add_interface(self, mesh: ObjectMesh) -> StepEvent:
         gaussians = self.base.set.gaussians
@@ -412,7 +404,8 @@ class Glass(Part):
         self._from_base = self.begun and bool(state[_BEGUN])
         self._glass = state[_GLASS].bool() if self.begun else self._glass
         if self.begun:
-            self._put_walls()
+            assert self.guide is not None
+            self.wall = walls_of(self.settings.transmittance, self.guide, self._glass, self._views)
             if self.wall is not None:
                 self.wall.restore(state)
         if _LEFT_OUT in state and self._left_out is None:

@@ -25,6 +25,7 @@ from rtgs.optics.settings import WallSettings
 from rtgs.train.parameters import ParameterGroup, Rate
 
 if TYPE_CHECKING:
+    from rtgs.methods.settings import TransmittanceSettings
     from rtgs.scenes.scene import View
 
 INDEX_LIMITS = (1.05, 2.5)
@@ -254,3 +255,15 @@ class WallLight:
             return None
         rows, paths = self._inner.paths(camera, self._guide).take(pixels)
         return InnerRays(rows, paths) if len(rows) else None
+
+
+def walls_of(
+    settings: TransmittanceSettings, guide: ObjectGuide, glass: Tensor, views: Sequence[View]
+) -> WallLight | None:
+    """Walls that reflect as thin glass does, where the settings ask for them; ``glass`` (F,) bool: where it is."""
+    walls = settings.wall
+    if walls.light != "fresnel":
+        return None
+    if settings.first_bounce != "transmittance" or settings.second_bounce == "none":
+        walls = replace(walls, bounces=0)  # the set that it would be followed through, or the far wall, is missing
+    return WallLight(walls, guide, glass, views, settings.rim_samples)
