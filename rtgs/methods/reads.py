@@ -46,7 +46,7 @@ def as_lit(settings: MethodSettings) -> MethodSettings:
     """Nothing of the walls where their weights are learned."""
     if settings.transmittance.wall.light == "fresnel":
         return settings
-    return replace(settings, transmittance=replace(settings.transmittance, wall=WallSettings()))
+    return replace(settings, transmittance=replace(settings.transmittance, wall=WallSettings(), rim_samples=0))
 
 
 def _without_losses(loss: LossSettings, prefixes: tuple[str, ...]) -> LossSettings:

@@ -210,7 +210,7 @@ class TransmittanceSettings:
     max_weight: float = 1.0
     rim: int = 2
     # Samples of each pixel at the object's outline, 4, 9, 16, ...: which share of it shows the object, and how much the
-    # wall reflects there (docs/glass_light.md). 0: the pixel's centre speaks for all of it.
+    # wall reflects there, with wall.light=fresnel (docs/glass_walls.md). 0: the pixel's centre speaks for all of it.
     rim_samples: int = field(default=0, metadata=UNLESS_DEFAULT)
     # Share of the masked pixels whose base depth is the object's first surface; with more the object is opaque and the
     # stage left out (docs/lab/transmittance.md: thin glass 0.05 to 0.5). 1: never.
@@ -258,8 +258,6 @@ class TransmittanceSettings:
             refuse_unless(value >= 1, f"method.transmittance.{name}", value, "at least 1")
         key, count = "method.transmittance.rim_samples", self.rim_samples
         refuse_unless(count >= 0 and math.isqrt(count) ** 2 == count, key, count, "a square number, or 0: none")
-        known = count == 0 or self.wall.light == "fresnel"
-        refuse_unless(known, key, count, "0 with wall.light=learned, whose weights fit the outline as it is")
         every = self.opacity_reset_every
         refuse_unless(every >= 0, "method.transmittance.opacity_reset_every", every, "at least 0 (0: never)")
 

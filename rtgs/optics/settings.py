@@ -70,7 +70,7 @@ class WallSettings:
     tint: tuple[float, float, float] = field(default=(1.0, 1.0, 1.0), metadata=UNLESS_DEFAULT)
     tint_rate: float = field(default=0.0, metadata=UNLESS_DEFAULT)  # of Adam; 0: the tint stays
     # Width of the walls' GGX facets: what they mirror and let pass is scattered so much. It stays: why, and what is
-    # left out, says docs/glass_light.md. 0: smooth.
+    # left out, says docs/glass_walls.md. 0: smooth.
     roughness: float = field(default=0.0, metadata=UNLESS_DEFAULT)
     rough_samples: int = field(default=8, metadata=UNLESS_DEFAULT)  # rays a pixel of rough glass, out of training
     bounces: int = 1  # reflections inside the object that are followed; 0: none

@@ -12,6 +12,7 @@ from torch import Tensor
 from rtgs.core.errors import RtgsError
 from rtgs.methods import Mode, RenderOptions
 from rtgs.methods.model import Model
+from rtgs.methods.reads import as_lit
 from rtgs.methods.settings import MethodSettings
 from rtgs.methods.shading.lights import Light, sum_of_lights
 from rtgs.methods.shading.outline import Outline, covering, with_beside
@@ -157,5 +158,11 @@ def test_settings_that_do_not_fit_are_refused():
     base = fresnel().transmittance
     with pytest.raises(RtgsError, match=r"method\.transmittance\.rim_samples=6 must be a square number"):
         replace(base, rim_samples=6)
-    with pytest.raises(RtgsError, match=r"rim_samples=4 must be 0 with wall\.light=learned"):
-        glass_recipe(rim_samples=4)
+
+
+def test_learned_weights_read_nothing_of_it(made: GlassScene):
+    settings = glass_recipe(rim_samples=4)
+    assert as_lit(settings) == as_lit(glass_recipe())
+    with torch.no_grad():
+        images = [picture(begun(each, made), made).image for each in (settings, glass_recipe())]
+    assert torch.equal(*images)

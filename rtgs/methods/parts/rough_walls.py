@@ -1,4 +1,4 @@
-"""Walls of glass that scatter a little: which ray stands for a pixel's lobe in one sample (docs/glass_light.md).
+"""Walls of glass that scatter a little: which ray stands for a pixel's lobe in one sample (docs/glass_walls.md).
 
 A pixel's rays follow sequences of low discrepancy (Roberts 2018), which the number of the sample walks through and
 which begin elsewhere in every pixel: two dimensions for the mirror ray, four for the two walls that the straight ray

@@ -1,4 +1,4 @@
-"""Pixels at an object's outline: partly glass, partly what is beside it (docs/glass_light.md).
+"""Pixels at an object's outline: partly glass, partly what is beside it (docs/glass_walls.md).
 
     C = a [ (1 - k) C_d + k sum of w C ] + (1 - a) P
 
