@@ -110,6 +110,19 @@ def test_tint_and_index_are_learned_together_and_go_on_bit_for_bit(made: GlassSc
     assert torch.equal(*both)
 
 
+def test_a_tint_is_found_again_from_a_picture(made: GlassScene):
+    target, tint = begun(fresnel(tint=(0.5, 0.8, 1.0)), made), (0.5, 0.8, 1.0)
+    method = begun(fresnel(tint_rate=0.03), made)
+    with torch.no_grad():
+        wanted = picture(target, made).image
+    (group,) = method.groups
+    for step in range(60):
+        (picture(method, made).image - wanted).square().mean().backward()
+        group.step(step)  # type: ignore[attr-defined]
+    found = group["tint"].detach()  # type: ignore[index]
+    torch.testing.assert_close(found, torch.tensor(tint), atol=0.05, rtol=0)
+
+
 @pytest.mark.parametrize("changes", [{"tint": (0.01, 0.01, 0.01)}, {"roughness": 0.5}, {"roughness": 1e-6}])
 def test_extreme_walls_are_finite_with_finite_gradients(made: GlassScene, changes: dict):
     method = begun(fresnel(index=2.5, bounces=3, tint_rate=0.01, **changes), made)
