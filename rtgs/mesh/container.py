@@ -226,6 +226,22 @@ class ObjectSurfaces:
 
 
 @dataclass(frozen=True)
+class SurfacePoints:
+    """Where N rays from one point meet the object; no gradient. Rows that miss it hold nothing else of use."""
+
+    hit: Tensor  # (N,) bool
+    near: Tensor  # (N,) float32 of the first surface, in lengths of the ray's direction
+    far: Tensor  # (N,) float32 of the second; ``near`` where there is none
+    second: Tensor  # (N,) bool: a second surface was found
+    normal: Tensor  # (N, 3) float32 unit, smoothed, facing the point
+    triangle: Tensor  # (N,) int64 of the first surface
+
+    def rows(self, chosen: Tensor) -> SurfacePoints:
+        """The rays ``chosen``, int64 or bool."""
+        return SurfacePoints(*(each[chosen] for each in vars(self).values()))
+
+
+@dataclass(frozen=True)
 class _Cached:
     """The hit pixels of one camera."""
 
@@ -270,21 +286,28 @@ class ObjectGuide:
         second = sum(item[1] for item in self._counts.values())
         return {"cameras": len(self._counts), "hit": hit, "second": second, "one_hit": hit - second}
 
+    def points(self, origin: Tensor, directions: Tensor) -> SurfacePoints:
+        """First and second surface along N rays (N, 3) float64 from ``origin`` (3,). A pane has no second surface."""
+        pair = self.mesh.rays.along(origin.expand_as(directions), directions)
+        hit = pair.hit
+        # From inside, or through a hole, the first crossing is the object's far side: there is no pair of surfaces.
+        second = pair.has_far & ~pair.near_back_facing & hit & (not self.mesh.flat)
+        facing = torch.zeros(len(directions), 3)
+        met = directions[hit]
+        places = (origin + pair.near[hit].double()[:, None] * met).numpy()
+        normal = interpolated(self.mesh.mesh, self.mesh.corners, pair.near_triangle[hit].numpy(), places)
+        facing[hit] = torch.from_numpy(_facing(normal, met.numpy(), pair.near_back_facing[hit].numpy()))
+        far = torch.where(second, pair.far, pair.near)
+        return SurfacePoints(hit, pair.near, far, second, facing, pair.near_triangle)
+
     def _cast(self, camera: Camera) -> _Cached:
         rays = camera.rays(torch.float64)
         candidates = _pixels_of_box(camera, self.mesh.bounds)
-        directions = rays.directions.reshape(-1, 3)[candidates]
-        pair = self.mesh.rays.along(rays.origin.expand_as(directions), directions)
-        hit = pair.hit
-        near, directions = pair.near[hit], directions[hit]
-        # From inside, or through a hole, the first crossing is the object's far side: there is no pair of surfaces.
-        second = pair.has_far[hit] & ~pair.near_back_facing[hit] & (not self.mesh.flat)
-        points = (rays.origin + near.double()[:, None] * directions).numpy()
-        normal = interpolated(self.mesh.mesh, self.mesh.corners, pair.near_triangle[hit].numpy(), points)
-        facing = torch.from_numpy(_facing(normal, directions.numpy(), pair.near_back_facing[hit].numpy()))
-        far = torch.where(second, pair.far[hit], near)
-        triangle = pair.near_triangle[hit].int()
-        return _Cached(candidates[hit].int(), near, far, second, facing.T.half().contiguous(), triangle)
+        met = self.points(rays.origin, rays.directions.reshape(-1, 3)[candidates])
+        hit = met.hit
+        shown = met.rows(hit)
+        normal = shown.normal.T.half().contiguous()
+        return _Cached(candidates[hit].int(), shown.near, shown.far, shown.second, normal, shown.triangle.int())
 
 
 def _facing(normal: np.ndarray, directions: np.ndarray, back: np.ndarray) -> np.ndarray:

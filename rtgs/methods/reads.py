@@ -48,7 +48,7 @@ def as_lit(settings: MethodSettings) -> MethodSettings:
     transmittance = settings.transmittance
     learned = transmittance.wall.light == "learned"
     if learned:
-        transmittance = replace(transmittance, wall=WallSettings())
+        transmittance = replace(transmittance, wall=WallSettings(), rim_samples=0)
     if not (learned and transmittance.interface.count > 0 and transmittance.max_weight > 0):
         transmittance = replace(transmittance, weight_bound="clamp")
     return replace(settings, transmittance=transmittance)

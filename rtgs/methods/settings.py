@@ -217,6 +217,9 @@ class TransmittanceSettings:
     # "clamp": w_r above max_weight teaches roughness and f0 nothing; "smooth": it nears max_weight and always does.
     weight_bound: Literal["clamp", "smooth"] = field(default="smooth", metadata={"recipe": UNLESS, "value": "clamp"})
     rim: int = 2
+    # Samples of each pixel at the object's outline, 4, 9, 16, ...: which share of it shows the object, and how much the
+    # wall reflects there, with wall.light=fresnel (docs/glass_walls.md). 0: the pixel's centre speaks for all of it.
+    rim_samples: int = field(default=0, metadata=UNLESS_DEFAULT)
     # Share of the masked pixels whose base depth is the object's first surface; with more the object is opaque and the
     # stage left out (docs/lab/transmittance.md: thin glass 0.05 to 0.5). 1: never.
     opaque_share: float = 0.9
@@ -270,6 +273,8 @@ class TransmittanceSettings:
         for name in ("densify_every", "sh_every", "cells", "per_cell", "rebuild_every", "most_hits"):
             value = getattr(self, name)
             refuse_unless(value >= 1, f"method.transmittance.{name}", value, "at least 1")
+        key, count = "method.transmittance.rim_samples", self.rim_samples
+        refuse_unless(count >= 0 and math.isqrt(count) ** 2 == count, key, count, "a square number, or 0: none")
         every = self.opacity_reset_every
         refuse_unless(every >= 0, "method.transmittance.opacity_reset_every", every, "at least 0 (0: never)")
 
@@ -306,6 +311,8 @@ class MethodSettings:
             return "method.transmittance.first_bounce_end=clip"
         if self.loss.transmission_depth > 0 and self.loss.transmission_depth_form == "per_hit":
             return "method.loss.transmission_depth_form=per_hit"
+        if self.transmittance.wall.light == "fresnel" and self.transmittance.wall.roughness > 0:
+            return f"method.transmittance.wall.roughness={self.transmittance.wall.roughness:g}"
         return ""
 
     def in_scene(self, *, glass: bool) -> MethodSettings:

@@ -2,8 +2,9 @@
 
 A wall has two surfaces so near to each other that a ray leaves it where it came in. Summing the reflections between
 them gives R = F + (1 - F)^2 F / (1 - F^2) = 2 F / (1 + F), and the rest, T = 1 - R, passes: clear glass absorbs
-nothing (Mitsuba's ``thindielectric``; Stam 2001 for the series). What it leaves out: absorption, the shift of the ray
-inside the wall, polarisation from one wall to the next.
+nothing (Mitsuba's ``thindielectric``; Stam 2001 for the series). Of tinted glass T = (1 - R) t passes, with t in (0, 1]
+for each colour. What it leaves out: that glass absorbs more the longer the way through the wall is, and takes from R
+as well; the shift of the ray inside the wall; polarisation from one wall to the next.
 
 Plain torch, any dtype and shape, differentiable in both arguments.
 """
@@ -52,3 +53,23 @@ def wall_reflectance(cosine: Tensor, index: Tensor | float) -> Tensor:
     """
     surface = fresnel_dielectric(cosine, index)
     return 2 * surface / (1 + surface)
+
+
+def passed(reflected: Tensor, wall: Tensor | float = 1.0, tint: Tensor | None = None) -> Tensor:
+    """T: the share of light that passes where a wall reflects the share ``reflected`` of it.
+
+    Parameters
+    ----------
+    reflected : Tensor
+        Share of all light, (..., 1) with a tint.
+    wall : Tensor or float
+        Share of the light that meets a wall at all, at least ``reflected``; what meets none passes as it is.
+    tint : (3,) Tensor, optional
+        In (0, 1], linear light; None: clear glass.
+
+    Returns
+    -------
+    Tensor
+        1 - R, or (..., 3): (1 - wall) + (wall - R) tint, so R + T is never above 1.
+    """
+    return 1 - reflected if tint is None else (1 - wall) + (wall - reflected) * tint

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from rtgs.optics.conductor import surface_reflectance
 from rtgs.optics.settings import OpticsSettings
 
 REMAP_COEFFICIENTS = (1.62142, 0.819955, 0.1734, 0.0171201, 0.000640711)  # of ln(alpha)^k, paper eq. 10
@@ -75,6 +76,13 @@ def schlick(f0: Tensor, cosine: Tensor) -> Tensor:
     return f0 + (1 - f0) * (1 - cosine) ** 5
 
 
+def fresnel_share(f0: Tensor, cosine: Tensor, settings: OpticsSettings) -> Tensor:
+    """F as the settings want it: Schlick's, or one of :func:`rtgs.optics.conductor.surface_reflectance`."""
+    if settings.fresnel == "schlick":
+        return schlick(f0, cosine)
+    return surface_reflectance(settings.fresnel, f0, cosine, settings.edge_tint)
+
+
 def inverse_gain(cosine: Tensor, width: Tensor, masking: str = "correlated") -> Tensor:
     """1 / S(c, g): the reciprocal stays finite where S does not."""
     slant = (cosine * cosine + width * width * (1 - cosine * cosine)).sqrt()
@@ -106,7 +114,7 @@ def specular_weights(cosine: Tensor, roughness: Tensor, f0: Tensor, settings: Op
     floor = settings.literal_cosine_floor if settings.weight == "literal" else settings.cosine_floor
     cosine = cosine.clamp(floor, 1)
     width = microfacet_width(roughness, settings)
-    fresnel = schlick(f0, cosine)
+    fresnel = fresnel_share(f0, cosine, settings)
     if settings.weight == "split_sum":
         from rtgs.optics.split_sum import split_sum_factors
 

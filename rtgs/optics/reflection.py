@@ -14,7 +14,8 @@ from rtgs.optics.settings import OpticsSettings
 def reflection_weight(cosine: Tensor, roughness: Tensor, f0: Tensor, settings: OpticsSettings) -> Tensor:
     """``specular_weights(...).reflection``, its twin, several times as fast where the native kernel knows the model.
 
-    That is float32 on the CPU, one f0 for all colours, weight "microfacet", masking "correlated", remap "pbrt".
+    That is float32 on the CPU, one f0 for all colours, weight "microfacet", masking "correlated", remap "pbrt", fresnel
+    "schlick".
 
     Args:
         cosine: (P,) n . omega_o; any value.
@@ -26,7 +27,8 @@ def reflection_weight(cosine: Tensor, roughness: Tensor, f0: Tensor, settings: O
         The shape of ``f0``.
     """
     maps = (cosine, roughness, f0)
-    plain = (settings.weight, settings.masking, settings.remap) == ("microfacet", "correlated", "pbrt")
+    model = (settings.weight, settings.masking, settings.remap, settings.fresnel)
+    plain = model == ("microfacet", "correlated", "pbrt", "schlick")
     if not (plain and all(m.dtype == torch.float32 and m.ndim == 1 and m.device.type == "cpu" for m in maps)):
         return specular_weights(cosine, roughness, f0, settings).reflection
     cosine = cosine.detach() if settings.detach_cosine else cosine

@@ -13,6 +13,7 @@ Weight = Literal["microfacet", "literal", "split_sum", "envgs"]
 Remap = Literal["pbrt", "none"]
 Masking = Literal["correlated", "separable"]
 Blend = Literal["srgb", "linear"]
+Fresnel = Literal["schlick", "none", "dielectric", "conductor", "coated"]
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,10 @@ class OpticsSettings:
     # paper); decision 5.
     max_gain: float = 1.0
     remap: Remap = "pbrt"  # width g(alpha) of the paper, once squared in D and G; "none": g = alpha
+    # F of a surface's f0 and the angle; "none": f0; "dielectric", "conductor": exact; "coated": a dielectric coat over
+    # C_d, which is lit by the 1 - F that the coat lets pass.
+    fresnel: Fresnel = field(default="schlick", metadata=UNLESS_DEFAULT)
+    edge_tint: float = field(default=1.0, metadata=UNLESS_DEFAULT)  # of "conductor", 0..1: rtgs/optics/conductor.py
     roughness_floor: float = 1e-3  # argument of g (PBRT): below 1.55e-4 the remap turns round
     masking: Masking = "correlated"  # height-correlated Smith; "separable": product of two G1
     cosine_floor: float = 1e-3  # of n . omega_o
@@ -39,6 +44,10 @@ class OpticsSettings:
             raise ValueError(
                 f"method.optics.max_gain={self.max_gain} must be a finite number of at least 0 (0: no bound)"
             )
+        refuse_unless(0 <= self.edge_tint <= 1, "method.optics.edge_tint", self.edge_tint, "between 0 and 1")
+        known = self.weight in ("microfacet", "literal") or self.fresnel == "schlick"
+        allowed = f"schlick, the only one that weight={self.weight} knows; or choose weight=microfacet"
+        refuse_unless(known, "method.optics.fresnel", self.fresnel, allowed)
         for name in ("roughness_floor", "cosine_floor", "literal_cosine_floor"):
             if not 0 < getattr(self, name) <= 1:
                 raise ValueError(f"method.optics.{name}={getattr(self, name)} must be above 0 and at most 1")
@@ -57,6 +66,13 @@ class WallSettings:
     light: Literal["learned", "fresnel"] = "learned"
     index: float = 1.5  # of refraction, at the start; window glass 1.52, borosilicate 1.47
     index_rate: float = 0.0  # of Adam, for the whole object; 0: the index stays
+    # Share of the light, linear, that each wall lets pass of what it does not reflect; at the start, for the object.
+    tint: tuple[float, float, float] = field(default=(1.0, 1.0, 1.0), metadata=UNLESS_DEFAULT)
+    tint_rate: float = field(default=0.0, metadata=UNLESS_DEFAULT)  # of Adam; 0: the tint stays
+    # Width of the walls' GGX facets: what they mirror and let pass is scattered so much. It stays: why, and what is
+    # left out, says docs/glass_walls.md. 0: smooth.
+    roughness: float = field(default=0.0, metadata=UNLESS_DEFAULT)
+    rough_samples: int = field(default=8, metadata=UNLESS_DEFAULT)  # rays a pixel of rough glass, out of training
     bounces: int = 1  # reflections inside the object that are followed; 0: none
     # Share of the third stage after which parts of the mesh between creases are judged from training views: walls or
     # openings, as that of a cup (docs/glass_light.md). 0: all are walls.
@@ -68,6 +84,12 @@ class WallSettings:
         refuse_unknown_words(self, "method.transmittance.wall")
         refuse_bad_numbers(self, "method.transmittance.wall")
         refuse_unless(1.05 <= self.index <= 2.5, "method.transmittance.wall.index", self.index, "between 1.05 and 2.5")
+        legal = len(self.tint) == 3 and all(0.01 <= value <= 1 for value in self.tint)
+        refuse_unless(legal, "method.transmittance.wall.tint", list(self.tint), "three numbers from 0.01 to 1")
+        key = "method.transmittance.wall.roughness"
+        refuse_unless(self.roughness <= 0.5, key, self.roughness, "at most 0.5: one ray a step tells nothing of more")
+        key = "method.transmittance.wall.rough_samples"
+        refuse_unless(self.rough_samples >= 1, key, self.rough_samples, "at least 1")
         refuse_unless(self.bounces >= 0, "method.transmittance.wall.bounces", self.bounces, "at least 0 (0: none)")
         refuse_unless(
             0 <= self.openings < 1, "method.transmittance.wall.openings", self.openings, "between 0 (never) and 1"

@@ -230,13 +230,13 @@ def _differences(old: str, new: str, settings: RunSettings) -> list[str]:
     def flat(value: object, prefix: str = "") -> dict[str, object]:
         if isinstance(value, dict):
             items = value.items()
-        elif isinstance(value, list):
+        elif isinstance(value, (list, tuple)):
             items = enumerate(value)
         else:
             return {prefix: value}
         return {key: leaf for name, child in items for key, leaf in flat(child, f"{prefix}.{name}".lstrip(".")).items()}
 
-    added = dict(_added_settings(settings))
+    added = {key: leaf for name, value in _added_settings(settings) for key, leaf in flat(value, name).items()}
     before, after = ({**added, **flat(parse_json(text))} for text in (old, new))
     keys = [key for key in sorted(before.keys() | after.keys()) if before.get(key) != after.get(key)]
     shown = [f"{key}: {before.get(key)} then, {after.get(key)} now" for key in keys[:5]]

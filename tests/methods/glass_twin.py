@@ -101,7 +101,7 @@ class GlassTwin:
         passing = weights.transmission
         if self.thin:
             own = thin_wall(mirrored.cosine, self.settings.wall.index)
-            passing = 1 - own
+            passing = (1 - own) * self.tint[:, None]
         reflection = torch.where(inside, own, weights.reflection)
         linear = self.method.settings.optics.blend == "linear"
         light = reflection * (to_linear(reflected.colors.T) if linear else reflected.colors.T)
@@ -122,6 +122,10 @@ class GlassTwin:
     @property
     def thin(self) -> bool:
         return self.settings.wall.light == "fresnel"
+
+    @property
+    def tint(self) -> Tensor:
+        return torch.tensor(self.settings.wall.tint, dtype=torch.float64)
 
     def _mirrored_inside(self, behind: Tensor, rows: Tensor) -> Tensor:
         """(R, 3) light that the far wall sends on: one path at a time, from its last wall back."""
@@ -148,7 +152,7 @@ class GlassTwin:
                 result.append(behind[row])
                 continue
             wall = thin_wall(every.cosine[path[0]], settings.wall.index)
-            result.append((1 - wall) * behind[row] + wall * self._along(every, found, 0, int(path[0])))
+            result.append((1 - wall) * self.tint * behind[row] + wall * self._along(every, found, 0, int(path[0])))
         return torch.stack(result)
 
     def _pixels_of(self, every: InnerPaths, leg: Leg) -> Tensor:
@@ -164,7 +168,7 @@ class GlassTwin:
         """(3,) light that arrives along one leg: contents over what comes through the wall and what it mirrors."""
         leg, met = every.legs[level], found[level][row]
         wall = leg.wall[row] * thin_wall(leg.cosine[row], self.settings.wall.index)
-        light = (1 - wall) * to_linear(met[4:])
+        light = ((1 - leg.wall[row]) + (leg.wall[row] - wall) * self.tint) * to_linear(met[4:])
         if level + 1 < len(found):
             on = (every.legs[level + 1].parent == row).nonzero()[:, 0]
             if len(on):

@@ -102,6 +102,8 @@ CASES = {
     ),
     "not normalised": (OpticsSettings(max_gain=1.0), MaterialSettings(specular=0.3, f0=0.5, normalized=False)),
     "split sum": (OpticsSettings(weight="split_sum"), MaterialSettings(specular=0.3, roughness=0.2)),
+    "conductor": (OpticsSettings(fresnel="conductor", edge_tint=0.7), MaterialSettings(specular=0.3, f0=0.6)),
+    "dielectric": (OpticsSettings(fresnel="dielectric"), MaterialSettings(specular=0.3, f0=0.1, f0_channels=3)),
     "envgs": (OpticsSettings(weight="envgs"), MaterialSettings(specular=0.3)),
     "background": (OpticsSettings(weight="envgs"), MaterialSettings(specular=0.3)),
 }

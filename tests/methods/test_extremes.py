@@ -23,6 +23,10 @@ BOUNDED = {  # the largest gradient by one input, for light and upstream within 
     "S_max 16": OpticsSettings(max_gain=16.0),
     "split sum": OpticsSettings(weight="split_sum"),
     "envgs": OpticsSettings(weight="envgs"),
+    "conductor": OpticsSettings(fresnel="conductor"),
+    "conductor, low edge": OpticsSettings(fresnel="conductor", edge_tint=0.1),
+    "dielectric": OpticsSettings(fresnel="dielectric"),
+    "coated": OpticsSettings(fresnel="coated"),
 }
 OPEN = {"no bound": OpticsSettings(max_gain=0.0), "literal": OpticsSettings(weight="literal")}
 LARGEST_GRADIENT = 1e5

@@ -33,15 +33,16 @@ CASES: dict[str, dict[str, object]] = {
 }
 
 
-@pytest.mark.parametrize("case", [*CASES, "raw directions, rgb f0", "linear light", "thin glass"])
+@pytest.mark.parametrize("case", [*CASES, "raw directions, rgb f0", "linear light", "thin glass", "tinted glass"])
 def test_image_and_every_gradient_are_those_of_the_twins(case: str):
     made = glass_scene()
     settings = glass_recipe(**CASES.get(case, {}))
     materials = MaterialSettings(specular=0.3)
-    if case in ("linear light", "thin glass"):
+    if case in ("linear light", "thin glass", "tinted glass"):
         settings = replace(settings, optics=replace(settings.optics, blend="linear"))
-    if case == "thin glass":
+    if case in ("thin glass", "tinted glass"):
         walls = WallSettings(light="fresnel", bounces=2)
+        walls = replace(walls, tint=(0.5, 0.7, 0.9)) if case == "tinted glass" else walls
         settings = replace(settings, transmittance=replace(settings.transmittance, normal="mesh", wall=walls))
     if case == "raw directions, rgb f0":
         settings = replace(settings, reflection=replace(settings.reflection, sh_direction="raw"))

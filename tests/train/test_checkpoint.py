@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from rtgs.methods.settings import MethodSettings
+from rtgs.methods.settings import MethodSettings, TransmittanceSettings
+from rtgs.optics.settings import WallSettings
 from rtgs.train import checkpoint as module
 from rtgs.train.checkpoint import (
     Checkpoint,
@@ -177,6 +178,18 @@ def test_a_damaged_newest_checkpoint_is_named_and_the_one_before_is_taken(tmp_pa
 
 def test_no_checkpoint_is_no_error(tmp_path: Path):
     assert load_newest(tmp_path / "absent", warn=pytest.fail) is None
+
+
+def test_a_list_among_the_settings_that_are_new_counts_as_its_default():
+    record = make(settings=PLAIN).record
+    old = json.loads(record.settings)
+    assert old["method"]["transmittance"]["wall"].pop("tint") == [1.0, 1.0, 1.0]
+    before = replace(record, settings=json.dumps(old, sort_keys=True), settings_digest="another")
+    check_resumable(before, record, PLAIN, warn=pytest.fail)
+    wall = WallSettings(tint=(0.5, 1.0, 1.0))
+    tinted = replace(PLAIN, method=replace(PLAIN.method, transmittance=TransmittanceSettings(wall=wall)))
+    with pytest.raises(CheckpointError, match=r"wall\.tint\.0: 1\.0 then, 0\.5 now"):
+        check_resumable(before, make(settings=tinted).record, tinted, warn=pytest.fail)
 
 
 def test_other_settings_are_refused_by_key():

@@ -18,17 +18,27 @@ from rtgs.mesh.container import ObjectGuide, ObjectMesh, ObjectSurfaces
 from rtgs.mesh.silhouettes import bounding
 from rtgs.methods.parts.base import BaseSet, composited
 from rtgs.methods.parts.gaussian_set import GaussianSet, densified, opacity_reset
-from rtgs.methods.parts.glass_evidence import glass_faces, has_masks, near_surface, on_surface, seen_bare
+from rtgs.methods.parts.glass_evidence import (
+    NOT_MASKED,
+    glass_faces,
+    has_masks,
+    near_surface,
+    on_surface,
+    seen_bare,
+    why_left_out,
+)
 from rtgs.methods.parts.glass_sets import drawn_in_box, interface_set, taken_from_base, transmittance_set
 from rtgs.methods.parts.interface_set import InterfaceSet, interface_surfels
 from rtgs.methods.parts.mirror import Mirror, Reflected, stored_surfels
 from rtgs.methods.parts.part import Frame, Part, Raster, Rows
+from rtgs.methods.parts.rough_walls import GlassView, Scatter, bent_rays
 from rtgs.methods.parts.straight_rays import FarWall, StraightRays
 from rtgs.methods.parts.traced_set import FollowingTree, TracedSet
-from rtgs.methods.parts.wall_light import InnerRays, WallLight
+from rtgs.methods.parts.wall_light import InnerRays, WallLight, walls_of
 from rtgs.methods.plans import transmittance_plan
-from rtgs.methods.shading.lights import Light, Traced, lit_view
+from rtgs.methods.shading.lights import Light, Traced, lit_view, mean_of_lights
 from rtgs.methods.shading.mirror import SurfacePixels, reflected_weight
+from rtgs.methods.shading.outline import Outline, with_beside
 from rtgs.methods.shading.straight import (
     GlassPixels,
     GlassRays,
@@ -56,7 +66,6 @@ if TYPE_CHECKING:
 _BEGUN = "third_stage"  # in the state: the stage has begun
 _GLASS = "glass_faces"
 _LEFT_OUT = "third_stage_left_out"  # instead of both
-NOT_MASKED = -1.0  # the stage is left out for want of masks
 
 
 class Glass(Part):
@@ -107,19 +116,15 @@ class Glass(Part):
 
     @property
     def groups(self) -> tuple[ParameterGroup, ...]:
-        return () if self.wall is None or self.wall.group is None else (self.wall.group,)
+        return () if self.wall is None else self.wall.groups
 
     @property
     def decisions(self) -> tuple[Decision, ...]:
         if self._left_out is None:
             asking = self.settings.single_rays if self.settings.transmittance.contents == "rasterized" else ""
-            traced = (Decision("contents are traced", f"{asking} reads the hits of single rays"),) if asking else ()
+            traced = (Decision("contents are traced", f"{asking} needs the hits of single rays"),) if asking else ()
             return traced if self.wall is None else (*traced, *self.wall.decisions)
-        why = "the masks of the training views are empty, or cover all of them"
-        if self._left_out != NOT_MASKED:
-            why = f"the masked object looks opaque: {self._left_out:.1%} of what its pixels show is its own surface "
-            why += "(method.transmittance.opaque_share)"
-        return (Decision("no transmittance stage", why),)
+        return (Decision("no transmittance stage", why_left_out(self._left_out)),)
 
     def mask(self, view: View) -> Tensor | None:
         """L_spec acts in masks that bound something, unless the stage was left out."""
@@ -141,21 +146,12 @@ class Glass(Part):
         self.begun = True
         mesh, settings = self.guide.mesh, self.settings.transmittance
         self._glass = glass_faces(self.guide, self._views, settings.interface.masked_share)
-        self._put_walls()
+        self.wall = walls_of(self.settings.transmittance, self.guide, self._glass, self._views)
         kept = self._seen_bare(stage.from_step)  # before the interface hides what is in the object
         if settings.interface.count > 0:
             yield self._add_interface(mesh)
         if settings.first_bounce == "transmittance":
             yield self._add_transmittance(mesh, kept)
-
-    def _put_walls(self) -> None:
-        """Walls that reflect as thin glass does, where the settings ask for them."""
-        assert self.guide is not None
-        walls = self.settings.transmittance.wall
-        transmittance = self.settings.transmittance
-        if transmittance.first_bounce != "transmittance" or transmittance.second_bounce == "none":
-            walls = replace(walls, bounces=0)  # the set that it would be followed through, or the far wall, is missing
-        self.wall = WallLight(walls, self.guide, self._glass, self._views) if walls.light == "fresnel" else None
 
     def _add_interface(self, mesh: ObjectMesh) -> StepEvent:
         gaussians = self.base.set.gaussians
@@ -225,24 +221,42 @@ class Glass(Part):
         glass = self.pixels(frame, flat)
         chosen = mirror.choose(frame, raster.buffers, glass.flat, always=glass.inside)
         straight = glass_rays(glass, chosen.index, rays.center, rays.directions)
-        inner = None
         if self.wall is not None:
             self.wall.set_for(frame.step if frame.training and frame.step < self.plan.judged else None)
-            inner = self.wall.inner_rays(frame.camera, straight, chosen.index[straight.rows])
-        met = mirror.reflect(frame, chosen, glass.flat, None if inner is None else inner.leaving)
-        reflection, transmission = self.weights(met, glass.inside[chosen.index], frame.camera, chosen.index)
-        passed = self.transmit(frame, straight, chosen.index[straight.rows], inner, met.others)
-        through = Light("transmission", "transmitted_color", transmission, passed.color, passed.parts)
+        scatters = [None] if self.wall is None else self.wall.scatters(frame.step if frame.training else None)
+        outline = None if self.wall is None else self.wall.outline(frame.camera, chosen.index, glass)
+        shown = GlassView(frame, chosen, glass, straight, outline)
+        samples = [self._sample(shown, each) for each in scatters]
+        (met, passed, _), lights = samples[0], mean_of_lights([lights for _, _, lights in samples])
+        if outline is not None:
+            aside = rays.directions[:, chosen.index[outline.rows[outline.partly]]].T
+            beside = self._straight(frame).beside(rays.center, aside, self.base.sh_degree(frame.step))
+            lights = with_beside(lights, met.pixels.specular, outline, beside)
         traced = Traced(
             glass.flat,
             chosen,
             met.pixels,
-            (met.light(reflection), through),
+            lights,
             {"transparent": glass.inside.reshape(shape), "specular": flat.specular.reshape(shape)},
             passed.first_bounce,
             (*met.observations, *passed.observations),
         )
         return lit_view(frame, raster, traced, self.settings.optics.blend)
+
+    def _sample(self, shown: GlassView, scatter: Scatter | None) -> tuple[Reflected, Transmission, tuple[Light, ...]]:
+        """What one ray of each kind meets behind each traced pixel, and the lights of it; ``scatter``: rough walls."""
+        frame, chosen, rays = shown.frame, shown.chosen, shown.rays
+        inner = None if self.wall is None else self.wall.inner_rays(frame.camera, rays, chosen.index[rays.rows])
+        leaving = None if inner is None else inner.leaving(scatter)
+        bent = None if scatter is None else bent_rays(shown, scatter)
+        met = self.mirror.reflect(frame, chosen, shown.glass.flat, leaving, None if bent is None else bent.mirrored)
+        inside = shown.glass.inside[chosen.index]
+        reflection, transmission = self.weights(met, inside, frame.camera, chosen.index, shown.outline)
+        near, onward = (rays, None) if bent is None else (bent.near, bent.far)
+        passed = self.transmit(frame, near, chosen.index[rays.rows], inner, met.others, onward)
+        through = Light("transmission", "transmitted_color", transmission, passed.color, passed.parts)
+        own, *coats = self.mirror.lights(met, reflection, inside)
+        return met, passed, (own, through, *coats)
 
     def appended(self, frame: Frame) -> Rows | None:
         """The interface: it is rasterised with the base set, as its surface in the object's pixels."""
@@ -255,7 +269,8 @@ class Glass(Part):
         """The pixels of the view's mask in training, of the silhouette or of given masks else."""
         settings = self.settings.transmittance
         assert self.guide is not None
-        surfaces, mask = self.guide.surfaces(frame.camera), bounding(frame.mask)
+        centers, mask = self.guide.surfaces(frame.camera), bounding(frame.mask)
+        surfaces = centers if self.wall is None else self.wall.surfaces(frame.camera)
         source = "given" if frame.training else frame.options.masks or settings.test_masks
         as_trained = frame.training or settings.test_masks == "as_trained"
         if source == "silhouette" or mask is None:  # a view without a mask shows the object all the same
@@ -264,6 +279,7 @@ class Glass(Part):
             inside = mask
         else:
             inside = mask & surfaces.hit  # method.md 6.3: where the ray misses the mesh nothing is transmitted
+        inside = inside | (surfaces.hit & ~centers.hit)
         inside = widened(inside, settings.rim if settings.interface.count > 0 else 0)
         made = glass_pixels(
             flat,
@@ -273,13 +289,15 @@ class Glass(Part):
             first_surface=settings.first_surface,
             normal=settings.normal,
         )
-        return made if self.wall is None else self.wall.on_glass(made)
+        return made if self.wall is None else self.wall.on_glass(made, frame.camera)
 
     def on_glass(self, surfaces: ObjectSurfaces) -> Tensor:
         """(H, W) bool: the mesh's first surface is one of the object's, not a lid or a label."""
         return surfaces.hit & self._glass[surfaces.triangle.clamp_min(0).long()]
 
-    def weights(self, met: Reflected, inside: Tensor, camera: Camera, pixels: Tensor) -> tuple[Tensor, Tensor]:
+    def weights(
+        self, met: Reflected, inside: Tensor, camera: Camera, pixels: Tensor, outline: Outline | None
+    ) -> tuple[Tensor, Tensor]:
         """w_r and w_t of the traced ``pixels`` (P,), with the S_max and the bound of the object's; ``inside`` (P,)
         bool."""
         settings, optics = self.settings.transmittance, self.settings.optics
@@ -287,7 +305,7 @@ class Glass(Part):
         cosine, reflection = met.rays.cosine, reflected_weight(met.rays.cosine, met.pixels, optics)
         if self.wall is not None:
             rows = inside.nonzero()[:, 0]
-            return self.wall.weights(reflection, cosine, rows, self.wall.walls(camera, pixels[rows]))
+            return self.wall.weights(reflection, cosine, rows, self.wall.walls(camera, pixels[rows]), outline)
         optics = optics if settings.max_gain is None else replace(optics, max_gain=settings.max_gain)
         largest = settings.max_weight if bounded else 0.0
         return glass_weights(reflection, cosine, met.pixels, inside, optics, largest, settings.weight_bound)
@@ -299,11 +317,17 @@ class Glass(Part):
         pixels: Tensor,
         inner: InnerRays | None = None,
         surroundings: Tensor | None = None,
+        onward: GlassRays | None = None,
     ) -> Transmission:
-        """C_t of the traced pixels; ``surroundings``: what the rays met that leave the object after ``inner`` paths."""
+        """C_t of the traced pixels; ``surroundings``: what the rays met that leave the object after ``inner`` paths;
+        ``onward``: the rays behind the far wall, if it bends them."""
+        wall = None if self.wall is None else FarWall(inner, surroundings, self.wall.index, self.wall.tint)
+        return self._straight(frame).transmit(frame, rays, pixels, wall, onward)
+
+    def _straight(self, frame: Frame) -> StraightRays:
         assert self.guide is not None
         own = self.transmittance
-        straight = StraightRays(
+        return StraightRays(
             self.settings,
             self.guide.mesh,
             self.base,
@@ -313,8 +337,6 @@ class Glass(Part):
             frame.training and self._depth_loss_on(frame.step),
             frame.training and own is not None and self._watching(own, frame.step),
         )
-        wall = None if self.wall is None else FarWall(inner, surroundings, self.wall.index)
-        return straight.transmit(frame, rays, pixels, wall)
 
     def _own_degree(self, step: int) -> int:
         """SH degree of the transmittance set: grown on its own clock, but never below what it came with."""
@@ -387,7 +409,8 @@ class Glass(Part):
         self._from_base = self.begun and bool(state[_BEGUN])
         self._glass = state[_GLASS].bool() if self.begun else self._glass
         if self.begun:
-            self._put_walls()
+            assert self.guide is not None
+            self.wall = walls_of(self.settings.transmittance, self.guide, self._glass, self._views)
             if self.wall is not None:
                 self.wall.restore(state)
         if _LEFT_OUT in state and self._left_out is None:

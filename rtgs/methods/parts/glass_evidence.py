@@ -28,6 +28,17 @@ _AT_FRONT = 0.15  # of the view's median thickness: what lies deeper is seen thr
 _ROUNDS = 3  # of neighbouring faces that vote together
 
 
+NOT_MASKED = -1.0  # the stage is left out for want of masks
+
+
+def why_left_out(share: float) -> str:
+    """In words; ``share`` of the masked pixels looks opaque, or ``NOT_MASKED``."""
+    if share == NOT_MASKED:
+        return "the masks of the training views are empty, or cover all of them"
+    looks = f"the masked object looks opaque: {share:.1%} of what its pixels show is its own surface "
+    return looks + "(method.transmittance.opaque_share)"
+
+
 def masked_views(views: Iterable[View]) -> Iterator[tuple[View, Tensor]]:
     """The views whose mask tells something, with it."""
     return ((view, mask) for view in views if (mask := bounding(view.mask)) is not None)

@@ -6,7 +6,7 @@ their own.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -38,6 +38,7 @@ from rtgs.methods.shading.mirror import (
     MirrorRays,
     SurfacePixels,
     mirror_rays,
+    pixel_weights,
     reflected_weight,
     showing_reflection,
     surface_pixels,
@@ -167,7 +168,7 @@ class Mirror(Part):
         flat = self.surface(raster.buffers)
         chosen = self.choose(frame, raster.buffers, flat)
         met = self.reflect(frame, chosen, flat)
-        lights = [met.light(reflected_weight(met.rays.cosine, met.pixels, self.settings.optics))]
+        lights = self.lights(met, reflected_weight(met.rays.cosine, met.pixels, self.settings.optics))
         traced = Traced(flat, chosen, met.pixels, lights, observations=met.observations)
         return lit_view(frame, raster, traced, self.settings.optics.blend)
 
@@ -207,12 +208,15 @@ class Mirror(Part):
         chosen: TracedPixels,
         flat: SurfacePixels,
         more: tuple[Tensor, Tensor] | None = None,
+        bent: Callable[[MirrorRays, SurfacePixels], MirrorRays] | None = None,
     ) -> Reflected:
-        """Trace the mirror rays of the chosen pixels, and ``more`` rays of another part: origins, directions (M, 3)."""
+        """Trace the mirror rays of the chosen pixels, and ``more`` rays of another part: origins, directions (M, 3).
+        ``bent``: those of rough surfaces in the place of smooth ones."""
         assert self.set is not None
         pixels = take_pixels(flat, chosen.index)
         view = frame.rays.directions.index_select(1, chosen.index)
         rays = mirror_rays(pixels, frame.rays.center, view, self.settings.reflection.sh_direction)
+        rays = rays if bent is None else bent(rays, pixels)
         ahead = self.set.density.needs_signal and densify_ahead(self.plan.reflection, frame.step)
         watched = frame.training and ahead
         origins, directions = rays.origins, rays.directions
@@ -227,6 +231,17 @@ class Mirror(Part):
         colors, others = (colors, None) if more is None else (colors[:own], colors[own:])
         color = (colors if chosen.shared is None else colors.index_select(0, chosen.shared.ray)).T
         return Reflected(pixels, rays, color, observations, others)
+
+    def lights(self, met: Reflected, weight: Tensor, bare: Tensor | None = None) -> tuple[Light, ...]:
+        """What the surface mirrors, with its ``weight``, and what it shows under a coat.
+
+        ``bare``: (P,) bool of pixels that have none, whatever the settings; None: there are no such pixels.
+        """
+        if self.settings.optics.fresnel != "coated":
+            return (met.light(weight),)
+        passed = pixel_weights(met.rays.cosine, met.pixels, self.settings.optics).transmission
+        passed = passed if bare is None else passed.masked_fill(bare, 0.0)
+        return met.light(weight), Light("coated", "coated_color", passed, met.pixels.diffuse)
 
     def trace_options(self, step: int, watched: bool) -> TraceOptions:
         """How mirror rays are traced at ``step``; ``watched``: with the sums that density control needs."""

@@ -29,6 +29,7 @@ class FarWall:
     inner: InnerRays | None  # None: no ray of this view is mirrored there
     surroundings: Tensor | None  # (M, 3) encoded colours that the leaving rays met
     index: Tensor | float  # of refraction
+    tint: Tensor | None = None  # (3,) of light that passes; None: none
 
 
 @torch.no_grad()
@@ -42,7 +43,7 @@ def _parts(contents: Tensor, color: Tensor, passing: Tensor, sent: Tensor, wall:
     through = passing
     if wall.inner is not None:
         none = torch.zeros(len(wall.inner.rows), 3)
-        through = far_wall(passing, none, wall.inner.rows, wall.inner.paths.cosine, wall.index)
+        through = far_wall(passing, none, wall.inner.rows, wall.inner.paths.cosine, wall.index, wall.tint)
     behind = rest * (through / sent.clamp_min(1e-9)).clamp(0, 1)
     return {"contents": own, "behind": behind, "inner": rest - behind}
 
@@ -72,18 +73,25 @@ class StraightRays:
     measured: bool
     watched: bool
 
-    def transmit(self, frame: Frame, rays: GlassRays, pixels: Tensor, wall: FarWall | None = None) -> Transmission:
+    def transmit(
+        self,
+        frame: Frame,
+        rays: GlassRays,
+        pixels: Tensor,
+        wall: FarWall | None = None,
+        onward: GlassRays | None = None,
+    ) -> Transmission:
         """C_t of the traced pixels: what the first bounce meets, and behind the object the second.
 
-        ``pixels`` (R,) int64: flattened, of the rays.
-        ``wall``: the object's far wall reflects light as well; None: it lets all pass.
+        ``pixels`` (R,) int64: flattened, of the rays. ``wall``: the object's far wall reflects light as well; None: it
+        lets all pass. ``onward``: the same rays behind it, if they are bent there.
         """
         degree = self.base.sh_degree(frame.step)
         first, observations = self._first_bounce(frame, rays, pixels, degree)
         assert first.colors is not None
         color, parts = first.colors, {}
         if self.settings.transmittance.second_bounce != "none" and not self.mesh.flat:
-            rows, behind = self._behind(rays, first, degree)
+            rows, behind = self._behind(rays if onward is None else onward, first, degree)
             shown = (1 - first.alpha)[:, None] if self.settings.transmittance.compositing == "over" else None
             if wall is None:
                 color = color.index_add(0, rows, behind if shown is None else shown[rows] * behind)
@@ -100,8 +108,8 @@ class StraightRays:
         """(R, 3) linear light that the far wall sends on: ``passing`` light, less what it reflects, and mirrored."""
         if wall.inner is None:
             return passing
-        arriving = inner_light(wall.inner.paths, self._legs(wall), wall.index)
-        return far_wall(passing, arriving, wall.inner.rows, wall.inner.paths.cosine, wall.index)
+        arriving = inner_light(wall.inner.paths, self._legs(wall), wall.index, wall.tint)
+        return far_wall(passing, arriving, wall.inner.rows, wall.inner.paths.cosine, wall.index, wall.tint)
 
     def _legs(self, wall: FarWall) -> list[TracedLeg]:
         """What was traced along the legs inside the object: its contents, and what the leaving rays met."""
@@ -175,6 +183,15 @@ class StraightRays:
             second = self._trace_base(origins, directions, options).colors
         assert second is not None
         return rows, second
+
+    def beside(self, center: Tensor, directions: Tensor, degree: int) -> Tensor:
+        """(B, 3) encoded colours that the base set, its SH up to ``degree``, shows along rays (B, 3) from the camera's
+        ``center``, as if the object were not there."""
+        start = self.settings.transmittance.offset * self.base.extent
+        options = self._options(start, torch.inf, degree, False)
+        found = self._trace_base(center.expand_as(directions).contiguous(), directions, options).colors
+        assert found is not None
+        return found
 
     def _depths(self, rays: GlassRays, first: TraceBuffers) -> FirstBounce:
         """Depths of the rays that have a second surface; with ``per_hit`` also what lies behind it."""

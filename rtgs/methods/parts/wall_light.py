@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -12,18 +13,23 @@ from torch import Tensor
 
 from rtgs.core.cameras import Camera
 from rtgs.core.decisions import Decision
-from rtgs.mesh.container import ObjectGuide
+from rtgs.mesh.container import ObjectGuide, ObjectSurfaces
+from rtgs.mesh.coverage import CoverageGuide
 from rtgs.mesh.inner_paths import InnerGuide, InnerPaths
 from rtgs.methods.parts.openings import Openings, judged_openings, upward_parts
+from rtgs.methods.parts.rough_walls import Scatter
+from rtgs.methods.shading.outline import Outline, covering
 from rtgs.methods.shading.straight import GlassPixels, GlassRays
-from rtgs.optics.dielectric import wall_reflectance
+from rtgs.optics.dielectric import passed, wall_reflectance
 from rtgs.optics.settings import WallSettings
 from rtgs.train.parameters import ParameterGroup, Rate
 
 if TYPE_CHECKING:
+    from rtgs.methods.settings import TransmittanceSettings
     from rtgs.scenes.scene import View
 
 INDEX_LIMITS = (1.05, 2.5)
+TINT_LIMITS = (0.01, 1.0)  # below, nothing can be seen through two walls
 
 
 @dataclass(frozen=True)
@@ -33,11 +39,16 @@ class InnerRays:
     rows: Tensor  # (K,) int64 into the straight rays
     paths: InnerPaths
 
-    @property
-    def leaving(self) -> tuple[Tensor, Tensor]:
+    def leaving(self, scatter: Scatter | None = None) -> tuple[Tensor, Tensor]:
         """(M, 3) origins and directions of the rays that leave the object, leg after leg."""
         legs = self.paths.legs
-        return torch.cat([leg.exit for leg in legs]), torch.cat([leg.direction for leg in legs])
+        directions = [leg.direction for leg in legs]
+        if scatter is not None:
+            pixels = self.paths.pixels
+            for number, leg in enumerate(legs):
+                pixels = pixels[leg.parent]
+                directions[number] = scatter.leaving(leg.direction, pixels, number + 1)
+        return torch.cat([leg.exit for leg in legs]), torch.cat(directions)
 
     def by_leg(self, values: Tensor) -> tuple[Tensor, ...]:
         """(M, ...) values of all legs, leg by leg."""
@@ -45,14 +56,14 @@ class InnerRays:
 
 
 class WallLight:
-    """The walls of one object.
+    """The walls of one object."""
 
-    Attributes:
-        group: the index of refraction, where it is learned; None: it stays.
-    """
-
-    def __init__(self, settings: WallSettings, guide: ObjectGuide, glass: Tensor, views: Sequence[View]) -> None:
+    def __init__(
+        self, settings: WallSettings, guide: ObjectGuide, glass: Tensor, views: Sequence[View], samples: int = 0
+    ) -> None:
+        """``samples`` of each pixel at the outline, a square number; 0: none are taken there."""
         self.settings = settings
+        self._coverage = CoverageGuide(guide, math.isqrt(samples)) if samples > 0 else None
         self._guide = guide
         self._glass = glass
         self._views = views
@@ -66,10 +77,20 @@ class WallLight:
         self._guides: dict[bytes, InnerGuide] = {}
         self._follow = settings.bounces > 0 and not guide.mesh.flat
         self._open(self._closed)
-        self.group: ParameterGroup | None = None
+        self._index: ParameterGroup | None = None
+        self._tint: ParameterGroup | None = None
+        tint = torch.tensor(settings.tint)
+        self._fixed_tint = None if bool((tint == 1).all()) else tint
         if settings.index_rate > 0:
             index = {"index": torch.tensor([settings.index])}
-            self.group = ParameterGroup("glass", index, Rate(settings.index_rate), limits=INDEX_LIMITS)
+            self._index = ParameterGroup("glass", index, Rate(settings.index_rate), limits=INDEX_LIMITS)
+        if settings.tint_rate > 0:
+            self._tint = ParameterGroup("glass_tint", {"tint": tint}, Rate(settings.tint_rate), limits=TINT_LIMITS)
+
+    @property
+    def groups(self) -> tuple[ParameterGroup, ...]:
+        """Index and tint, where they are learned."""
+        return tuple(each for each in (self._index, self._tint) if each is not None)
 
     def set_for(self, step: int | None) -> None:
         """The walls of a picture: what was judged; before that, in training (``step``), parts that may be openings are
@@ -148,22 +169,85 @@ class WallLight:
     @property
     def index(self) -> Tensor | float:
         """Of refraction: a number, or (1,) with its graph."""
-        return self.settings.index if self.group is None else self.group["index"]
+        return self.settings.index if self._index is None else self._index["index"]
 
-    def on_glass(self, glass: GlassPixels) -> GlassPixels:
+    @property
+    def tint(self) -> Tensor | None:
+        """(3,) of the light that passes a wall, linear; with its graph where it is learned; None: clear glass."""
+        return self._fixed_tint if self._tint is None else self._tint["tint"]
+
+    def surfaces(self, camera: Camera) -> ObjectSurfaces:
+        """Where the pixels of a camera meet the object, at their centre or at the outline in some of their samples."""
+        return (self._coverage or self._guide).surfaces(camera)
+
+    def on_glass(self, glass: GlassPixels, camera: Camera) -> GlassPixels:
         """The pixels whose first surface is known to be glass, with all of their k_s: 1 where nothing else covers
         them."""
         specular = (glass.flat.specular / self.settings.cover).clamp_max(1)
+        if self._coverage is not None:
+            found = self._coverage.coverage(camera)
+            own = covering(glass.flat.specular[found.pixels], found.share, self.settings.cover)
+            specular = specular.index_copy(0, found.pixels, own)
         specular = torch.where(glass.known, specular, glass.flat.specular)
         return replace(glass, flat=replace(glass.flat, specular=specular))
 
-    def weights(self, reflection: Tensor, cosine: Tensor, rows: Tensor, walls: Tensor | float) -> tuple[Tensor, Tensor]:
-        """w_r and w_t of P traced pixels: R and 1 - R in ``rows``, elsewhere ``reflection`` (P,) or (3, P), and 0.
-        ``walls``: of these rows, as :meth:`walls` has them; R is 0 where there is none."""
+    def outline(self, camera: Camera, pixels: Tensor, glass: GlassPixels) -> Outline | None:
+        """Of the traced flattened ``pixels`` (P,), those at the outline that are glass; None: there are none."""
+        if self._coverage is None:
+            return None
+        found = self._coverage.coverage(camera)
+        rows, own = found.rows(pixels)
+        shown = (glass.known & glass.inside)[pixels[rows]]
+        rows, own = rows[shown], own[shown]
+        if len(rows) == 0:
+            return None
+        assert self._opened is not None
+        triangle = found.triangle[own].long()
+        met = (triangle >= 0).float()
+        wall = 1 - self._opened[triangle.clamp_min(0)].float()
+        return Outline(rows, met.mean(1), found.cosine[own], met / met.sum(1, keepdim=True), wall)
+
+    def weights(
+        self,
+        reflection: Tensor,
+        cosine: Tensor,
+        rows: Tensor,
+        walls: Tensor | float,
+        outline: Outline | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """w_r and w_t of P traced pixels: R and T in ``rows``, elsewhere ``reflection`` (P,) or (3, P), and 0.
+
+        ``walls``: of these rows, as :meth:`walls` has them; R is 0 and T is 1 where there is none. ``outline``: some of
+        these rows, whose samples have more angles than ``cosine``. Without a tint T is 1 - R in the shape of
+        ``reflection``, with one it is (3, P).
+        """
+        none = torch.zeros_like(reflection) if self.tint is None else torch.zeros(3, reflection.shape[-1])
         reflected = walls * wall_reflectance(cosine.index_select(0, rows), self.index)
+        weights = self._put(reflection, none, rows, reflected, walls)
+        if outline is None:
+            return weights
+        return self._put(*weights, outline.rows, *outline.reflected(self.index))
+
+    def _put(
+        self, reflection: Tensor, passing: Tensor, rows: Tensor, reflected: Tensor, walls: Tensor | float
+    ) -> tuple[Tensor, Tensor]:
+        """w_r and w_t with R = ``reflected`` and its T in ``rows``."""
         full = reflected.expand(*reflection.shape[:-1], -1)
-        passed = torch.zeros_like(reflection).index_copy(-1, rows, 1 - full)
-        return reflection.index_copy(-1, rows, full), passed
+        through = 1 - full
+        if self.tint is not None:
+            walls = walls[:, None] if isinstance(walls, Tensor) else walls
+            through = passed(reflected[:, None], walls, self.tint).T
+        return reflection.index_copy(-1, rows, full), passing.index_copy(-1, rows, through)
+
+    def scatters(self, step: int | None) -> list[Scatter | None]:
+        """The samples of rough walls that make a picture: that of a ``step`` of training, or as many as the settings
+        want out of it (None); smooth walls need one, which is none."""
+        width = self.settings.roughness
+        if width == 0:
+            return [None]
+        numbers = range(self.settings.rough_samples) if step is None else (step,)
+        index = float(torch.as_tensor(self.index).detach())
+        return [Scatter(width, index, number) for number in numbers]
 
     def inner_rays(self, camera: Camera, rays: GlassRays, pixels: Tensor) -> InnerRays | None:
         """Behind the straight ``rays``, which go through these flattened ``pixels`` (R,); None: there are none."""
@@ -171,3 +255,15 @@ class WallLight:
             return None
         rows, paths = self._inner.paths(camera, self._guide).take(pixels)
         return InnerRays(rows, paths) if len(rows) else None
+
+
+def walls_of(
+    settings: TransmittanceSettings, guide: ObjectGuide, glass: Tensor, views: Sequence[View]
+) -> WallLight | None:
+    """Walls that reflect as thin glass does, where the settings ask for them; ``glass`` (F,) bool: where it is."""
+    walls = settings.wall
+    if walls.light != "fresnel":
+        return None
+    if settings.first_bounce != "transmittance" or settings.second_bounce == "none":
+        walls = replace(walls, bounces=0)  # the set that it would be followed through, or the far wall, is missing
+    return WallLight(walls, guide, glass, views, settings.rim_samples)

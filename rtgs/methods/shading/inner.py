@@ -1,10 +1,10 @@
 """Light mirrored inside transparent objects: from what was traced along a path to what it brings to the far wall.
 
-    I_k = C_k + (1 - A_k) [ (1 - R_k) E_k + R_k I_{k+1} ]
+    I_k = C_k + (1 - A_k) [ (1 - R_k) t E_k + R_k I_{k+1} ]
 
 of leg k of a path: C_k and A_k what the contents show along it, E_k the surroundings seen through the wall at its end,
-R_k the reflectance of that wall. Contents are composited over what lies behind them in the encoding of the photos, as
-everywhere; walls mix linear light.
+R_k the reflectance of that wall, t its tint. Contents are composited over what lies behind them in the encoding of the
+photos, as everywhere; walls mix linear light.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from rtgs.mesh.inner_paths import InnerPaths
-from rtgs.optics.dielectric import wall_reflectance
+from rtgs.optics.dielectric import passed, wall_reflectance
 from rtgs.optics.light import decoded, encoded
 
 LINEAR = "linear"
@@ -31,13 +31,18 @@ class TracedLeg:
     surroundings: Tensor  # (L, 3) E, encoded
 
 
-def inner_light(paths: InnerPaths, traced: Sequence[TracedLeg], index: Tensor | float) -> Tensor:
-    """(K, 3) linear light that comes to the far wall from inside, before it is mirrored there; any dtype."""
+def inner_light(
+    paths: InnerPaths, traced: Sequence[TracedLeg], index: Tensor | float, tint: Tensor | None = None
+) -> Tensor:
+    """(K, 3) linear light that comes to the far wall from inside, before it is mirrored there; any dtype.
+
+    ``tint`` (3,): of light that passes a wall; None: none.
+    """
     arriving: Tensor | None = None
     for k in reversed(range(len(traced))):
         leg, met = paths.legs[k], traced[k]
         reflected = (leg.wall * wall_reflectance(leg.cosine.to(met.alpha.dtype), index))[:, None]
-        light = (1 - reflected) * decoded(met.surroundings, LINEAR)
+        light = passed(reflected, leg.wall[:, None], tint) * decoded(met.surroundings, LINEAR)
         if arriving is not None:
             later = torch.zeros_like(light).index_copy(0, paths.legs[k + 1].parent, arriving)
             light = light + reflected * later
@@ -46,7 +51,14 @@ def inner_light(paths: InnerPaths, traced: Sequence[TracedLeg], index: Tensor | 
     return arriving
 
 
-def far_wall(behind: Tensor, arriving: Tensor, rows: Tensor, cosine: Tensor, index: Tensor | float) -> Tensor:
+def far_wall(
+    behind: Tensor,
+    arriving: Tensor,
+    rows: Tensor,
+    cosine: Tensor,
+    index: Tensor | float,
+    tint: Tensor | None = None,
+) -> Tensor:
     """(R, 3) linear light that the far wall sends to the eye: what it lets pass, and in ``rows`` what it mirrors.
 
     Args:
@@ -54,7 +66,10 @@ def far_wall(behind: Tensor, arriving: Tensor, rows: Tensor, cosine: Tensor, ind
         arriving: (K, 3) of :func:`inner_light`.
         rows: (K,) int64 into the R rays, those with a wall that mirrors.
         cosine: (K,) of the angle of incidence there.
+        index: of refraction.
+        tint: (3,) of light that passes; None: none.
     """
     reflected = wall_reflectance(cosine.to(behind.dtype), index)[:, None]
-    passing = torch.ones(len(behind), 1, dtype=behind.dtype).index_copy(0, rows, 1 - reflected)
+    through = passed(reflected, 1.0, tint)
+    passing = torch.ones(len(behind), through.shape[1], dtype=behind.dtype).index_copy(0, rows, through)
     return (passing * behind).index_add(0, rows, reflected * arriving)

@@ -7,8 +7,9 @@ lights; they are blended here, in the space that ``method.optics.blend`` names, 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
+import torch
 from torch import Tensor
 
 from rtgs.methods.parts.part import Frame, Raster
@@ -47,6 +48,26 @@ def sum_of_lights(lights: Sequence[Light], blend: str) -> Tensor:
     """(3, P) sum of w C, linear light with ``blend`` "linear"."""
     first, *others = (light.weight * decoded(light.color, blend) for light in lights)
     return sum(others, first)
+
+
+def mean_of_lights(samples: Sequence[Sequence[Light]]) -> tuple[Light, ...]:
+    """The lights of several samples of one view, each with the mean of its linear light under the first's weight.
+
+    The weights of all samples are the same; colours are encoded, as always.
+    """
+    first, *others = samples
+    if not others:
+        return tuple(first)
+    share = 1 / len(samples)
+    found = []
+    for place, light in enumerate(first):
+        same = [each[place] for each in samples]
+        color = sum(
+            (share * decoded(each.color, "linear") for each in same[1:]), share * decoded(light.color, "linear")
+        )
+        parts = {name: torch.stack([each.parts[name] for each in same]).mean(0) for name in light.parts}
+        found.append(replace(light, color=encoded(color, "linear"), parts=parts))
+    return tuple(found)
 
 
 def lit_view(frame: Frame, raster: Raster, traced: Traced, blend: str) -> RenderedView:

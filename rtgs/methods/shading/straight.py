@@ -31,7 +31,7 @@ class GlassRays:
 
     rows: Tensor  # (R,) int64 into the traced pixels
     count: int  # of traced pixels
-    center: Tensor  # (3,) camera centre
+    center: Tensor  # (3,) camera centre, or (R, 3) where each ray was bent and has its own
     directions: Tensor  # (R, 3) camera-z component 1
     near: Tensor  # (R,) z-depth of the first surface
     far: Tensor  # (R,) of the second; ``near`` where there is none
@@ -40,7 +40,8 @@ class GlassRays:
     def at(self, depth: Tensor, rows: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Origins at these z-depths and directions, of all rays or of some."""
         directions = self.directions if rows is None else self.directions[rows]
-        return self.center + depth[:, None] * directions, directions
+        center = self.center if rows is None or self.center.ndim == 1 else self.center[rows]
+        return center + depth[:, None] * directions, directions
 
 
 @dataclass(frozen=True)
