@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING
 
-import yaml
-
 from pipelines.publishing.results import final_training
 from pipelines.steps.training import read_summary
 from rtgs.config.compose import compose
 from rtgs.config.locate import choices_of, conf_dir
 from rtgs.config.schema import RunConfig
+from rtgs.core.documents import load_yaml
 from rtgs.methods import find_method
 from rtgs.train.settings import ScheduleSettings
 from rtgs.workflow.fingerprint import flatten
@@ -63,7 +62,7 @@ def _printed(config: RunConfig, row: str) -> RunConfig:
     method, _, ablation = row.partition(", ")
     words = [f"method={PRINTED.get(method, method)}", "preset=paper", f"scene={_scene_file(config.scene.name)}"]
     if ablation:
-        needs = yaml.safe_load((conf_dir() / "ablation" / f"{ablation}.yaml").read_text())["ablation"].get("needs", ())
+        needs = load_yaml(conf_dir() / "ablation" / f"{ablation}.yaml")["ablation"].get("needs", ())
         words += [f"ablation={ablation}"] if set(needs) <= find_method(PRINTED.get(method, method)).has else []
     return compose([*words, f"seed={config.seed}"])[0]
 
@@ -71,7 +70,7 @@ def _printed(config: RunConfig, row: str) -> RunConfig:
 def _scene_file(name: str) -> str:
     """The file of the papers' scene of this name; another scene: the demo, whose settings are the defaults."""
     for choice in choices_of("scene"):
-        if "/" in choice and yaml.safe_load((conf_dir() / "scene" / f"{choice}.yaml").read_text())["name"] == name:
+        if "/" in choice and load_yaml(conf_dir() / "scene" / f"{choice}.yaml")["name"] == name:
             return choice
     return "demo"
 

@@ -72,7 +72,7 @@ def create_method(
     if object_mesh is not None and spec.object_stage(settings) is None:
         raise ValueError(f"method {spec.name} has no stage that takes an object mesh, or it is switched off")
     pixels = max((view.camera.width * view.camera.height for view in scene.train), default=0)
-    settings, lowered = bound_by_pixels(settings, pixels)
+    settings, lowered = bound_by_pixels(settings.in_scene(glass=object_mesh is not None), pixels)
     decisions = (*lowered, *spec.unread_losses(settings))
     stages = spec.timeline(settings, schedule, transparent=object_mesh is not None)
     made = spec.build(

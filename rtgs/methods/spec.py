@@ -202,6 +202,7 @@ class MethodSpec:
         Raises:
             ValueError: a stage would start before the one before it.
         """
+        settings = settings.in_scene(glass=transparent and self.object_stage(settings) is not None)
         total = schedule.total
         begun: list[tuple[StageSpec, int]] = []
         for stage in self.stages:

@@ -48,7 +48,7 @@ def test_every_method_renders_and_lowers_its_loss(name: str):
         last, _ = train_step(method, scene, step)
     assert float(last.total.detach()) < 0.8 * float(first.total.detach())
     reflective = (Stage("diffuse", 0, 3), Stage("reflection", 3, 60))
-    assert method.stages == (reflective if name in ("envgs", "rtgs") else (Stage("diffuse", 0, 60),))
+    assert method.stages == (reflective if name in ("envgs", "rtgs", "rtgs_printed") else (Stage("diffuse", 0, 60),))
     assert find_method(name).timeline(method.settings, method.schedule) == method.stages
 
 

@@ -27,7 +27,7 @@ def paper(method: str):
 
 def test_the_papers_boundaries():
     settings, plan = paper("rtgs")
-    assert (plan.start, plan.judged, plan.propagation_until) == (3000, 4000, 18000)
+    assert (plan.start, plan.judged, plan.propagation_until) == (3000, 3000, 18000)
     assert (plan.base.densify_until, plan.reflection.densify_until) == (20000, 21000)
     steps = range(0, 25000, 100)
     densified = [step for step in steps if densify_due(plan.reflection, step)]

@@ -139,7 +139,8 @@ def _bounded(weight: Tensor, largest: float, bound: str) -> Tensor:
         return weight.clamp_max(largest)
     # by the reciprocal: the fourth power of a large weight would overflow
     inverse = weight.clamp_min(1e-6).reciprocal()
-    return (inverse.pow(4) + largest**-4).pow(-0.25)
+    # Roots and squares are rounded the same in every block of a tensor, powers are not: bits of any number of threads.
+    return (inverse.square().square() + largest**-4).sqrt().sqrt().reciprocal()
 
 
 def depth_loss(bounce: FirstBounce, form: str, pixels: int) -> Tensor:

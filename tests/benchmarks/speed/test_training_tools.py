@@ -49,7 +49,7 @@ def test_training_parts_of_a_glass_scene_holds_mesh_and_third_stage(run) -> None
     figures = run(training_parts, "--scene", "tall_bottle", *words)
     third = figures["stages"][2]
     assert [stage["stage"] for stage in figures["stages"]] == ["diffuse", "reflection", "transmittance"]
-    assert [stage["preset_steps"] for stage in figures["stages"]] == [36, 36, 48], "of preset smoke"
+    assert [stage["preset_steps"] for stage in figures["stages"]] == [24, 48, 48], "of preset smoke, before glass"
     assert {"base", "reflection", "transmittance", "interface"} == set(third["surfels"])
     assert third["rays"] > figures["stages"][1]["rays"], "straight rays besides"
     assert third["fixed"] > 0

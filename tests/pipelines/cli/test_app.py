@@ -217,7 +217,7 @@ def test_a_failing_job_does_not_stop_the_others(words, first, capsys):
 @pytest.mark.parametrize(
     ("override", "expected"),
     [
-        ("method.los.l1=1", ["Key 'los'", "Did you mean loss?"]),
+        ("method.los.l1=1", ["Key 'los'", "Did you mean loss"]),
         ("scene.path=/no/such/folder", ["capture folder /no/such/folder does not exist"]),
         ("scene=/no/such/folder", ["capture folder /no/such/folder does not exist", "correct scene.path"]),
         ("threads=0", ["threads=0 must be at least 1"]),
