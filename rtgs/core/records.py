@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 from rtgs.core.build import build
 from rtgs.core.documents import load_json
 from rtgs.core.errors import RtgsError
+from rtgs.core.refuse import shown
 
 T = TypeVar("T")
 STORED = (
@@ -70,7 +71,8 @@ def record_of(cls: type[T], values: Mapping[str, Any], path: Path, remedy: str =
 
 def damaged(path: Path, why: object, remedy: str = STORED) -> RtgsError:
     """The error of a file that is not what it should be."""
-    return RtgsError(f"{path} cannot be read as a record ({why}): {remedy}")
+    text = str(why)
+    return RtgsError(f"{path} cannot be read as a record ({text[:400]}{'...' if len(text) > 400 else ''}): {remedy}")
 
 
 def _misfit(hint: Any, value: Any, where: str = "") -> str:
@@ -95,4 +97,4 @@ def _misfit(hint: Any, value: Any, where: str = "") -> str:
 
 
 def _wrong(value: object, where: str) -> str:
-    return f"{where or 'its content'} is {value!r}"
+    return f"{where or 'its content'} is {shown(value)}"

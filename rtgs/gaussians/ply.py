@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from rtgs.core.errors import RtgsError
+from rtgs.core.ply_header import PlyHeaderError, PlySizeError, check_ply
 from rtgs.gaussians.channels import Channel
 from rtgs.gaussians.ellipsoids import Ellipsoids
 from rtgs.gaussians.harmonics import rgb_to_sh_dc
@@ -249,26 +250,15 @@ def _read_vertices(path: Path) -> plyfile.PlyElement:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     try:
-        ply = plyfile.PlyData.read(str(path))
-    except (plyfile.PlyHeaderParseError, UnicodeDecodeError) as error:
+        check_ply(path)
+        with np.errstate(over="ignore"):  # numbers in text beyond their type become inf, which is refused
+            ply = plyfile.PlyData.read(str(path))
+    except PlySizeError as error:
+        raise RtgsError(f"{path} is damaged or truncated: {error}") from error
+    except (PlyHeaderError, plyfile.PlyHeaderParseError, UnicodeDecodeError) as error:
         raise RtgsError(f"{path} is not a PLY file: {error}") from error
-    except (plyfile.PlyParseError, ValueError, MemoryError, OverflowError) as error:
+    except (plyfile.PlyParseError, ValueError, MemoryError, OverflowError, OSError) as error:
         raise RtgsError(f"{path} is damaged or truncated: {error}") from error
     if "vertex" not in ply:
         raise RtgsError(f"{path}: no element 'vertex'; it has {', '.join(e.name for e in ply.elements) or 'none'}")
-    if (unread := _unread_bytes(path, ply)) > 0:
-        raise RtgsError(
-            f"{path} is damaged: {unread} bytes after the {ply['vertex'].count} vertices its header announces"
-        )
     return ply["vertex"]
-
-
-def _unread_bytes(path: Path, ply: plyfile.PlyData) -> int:
-    """Bytes after the data of a binary file whose rows have one length (else 0: the parser has counted)."""
-    if ply.text or any(isinstance(p, plyfile.PlyListProperty) for e in ply.elements for p in e.properties):
-        return 0
-    with path.open("rb") as file:
-        while file.readline().strip() != b"end_header":
-            pass
-        header = file.tell()
-    return path.stat().st_size - header - sum(e.count * e.data.dtype.itemsize for e in ply.elements)

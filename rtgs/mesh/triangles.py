@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rtgs.core.errors import RtgsError
+from rtgs.core.ply_header import check_ply
 
 if TYPE_CHECKING:
-    from plyfile import PlyData
+    from plyfile import PlyData, PlyElement
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,8 @@ class TriangleMesh:
     colors: np.ndarray | None = None  # (V, 3) float32 in [0, 1]
 
     def __post_init__(self) -> None:
-        vertices, faces = np.asarray(self.vertices, np.float32), np.asarray(self.faces, np.int32)
+        with np.errstate(over="ignore"):  # beyond float32: inf, which is refused
+            vertices, faces = np.asarray(self.vertices, np.float32), np.asarray(self.faces, np.int32)
         if vertices.ndim != 2 or vertices.shape[1:] != (3,) or faces.ndim != 2 or faces.shape[1:] != (3,):
             raise ValueError(f"mesh takes vertices (V, 3) and faces (F, 3), got {vertices.shape} and {faces.shape}")
         if not np.isfinite(vertices).all():
@@ -70,8 +72,10 @@ def read_mesh_ply(path: Path) -> TriangleMesh:
     from plyfile import PlyParseError
 
     try:
-        data = _read_ply(path)
-    except (PlyParseError, OSError, ValueError) as error:
+        check_ply(path)
+        with np.errstate(over="ignore"):  # numbers in text beyond their type become inf, which is refused
+            data = _read_ply(path)
+    except (PlyParseError, OSError, ValueError, MemoryError, OverflowError) as error:
         raise RtgsError(f"{path} is not a readable PLY: {error}") from error
     names = {element.name for element in data.elements}
     if "vertex" not in names or "face" not in names:
@@ -79,18 +83,34 @@ def read_mesh_ply(path: Path) -> TriangleMesh:
     vertex, face = data["vertex"], data["face"]
     if not {"x", "y", "z"} <= {item.name for item in vertex.properties}:
         raise RtgsError(f"{path} has vertices without x y z; export it again")
-    vertices = np.stack([np.asarray(vertex[name], np.float32) for name in "xyz"], axis=1)
-    rows = list(face[face.properties[0].name])
-    if any(len(row) != 3 for row in rows):
-        raise RtgsError(f"{path} holds faces with other than three corners; triangulate it first")
-    faces = np.array(rows, np.int32).reshape(-1, 3)
-    colors = None
-    if {"red", "green", "blue"} <= {item.name for item in vertex.properties}:
-        colors = np.stack([np.asarray(vertex[name], np.float32) / 255 for name in ("red", "green", "blue")], axis=1)
+    if not face.count:
+        raise RtgsError(f"{path} holds no faces; is it a point cloud?")
     try:
-        return TriangleMesh(vertices, faces, colors)
-    except ValueError as error:
+        vertices, colors = _columns(vertex, ("x", "y", "z")), None
+        if {"red", "green", "blue"} <= {item.name for item in vertex.properties}:
+            colors = _columns(vertex, ("red", "green", "blue")) / np.float32(255)
+        return TriangleMesh(vertices, _triangles(path, face), colors)
+    except RtgsError:
+        raise
+    except (ValueError, TypeError, OverflowError) as error:
         raise RtgsError(f"{path} is not a usable mesh: {error}") from error
+
+
+def _columns(element: PlyElement, names: tuple[str, ...]) -> np.ndarray:
+    """(N, 3) float32; a property that is a list is refused."""
+    with np.errstate(over="ignore"):  # doubles beyond float32 become inf, which the mesh refuses
+        return np.stack([np.asarray(element[name]).astype(np.float32) for name in names], axis=1)
+
+
+def _triangles(path: Path, face: PlyElement) -> np.ndarray:
+    """(F, 3) int32 corners of the first property of the faces."""
+    rows = list(face[face.properties[0].name])
+    if any(np.shape(row) != (3,) for row in rows):
+        raise RtgsError(f"{path} holds faces with other than three corners; triangulate it first")
+    corners = np.array(rows).reshape(-1, 3)
+    if not np.issubdtype(corners.dtype, np.integer):
+        raise RtgsError(f"{path} holds corners of faces that are no whole numbers; export it again")
+    return np.clip(corners, -1, np.iinfo(np.int32).max).astype(np.int32)  # beyond: no vertex, which the mesh refuses
 
 
 def _read_ply(path: Path) -> PlyData:
@@ -133,9 +153,9 @@ def read_mesh_obj(path: Path) -> TriangleMesh:
                     raise ValueError(f"{line!r}: vertices are counted from 1")
                 corner = [number - 1 if number > 0 else len(vertices) + number for number in numbers]
                 faces += [(corner[0], corner[k], corner[k + 1]) for k in range(1, len(corner) - 1)]
-        mesh = TriangleMesh(np.array(vertices).reshape(-1, 3), np.array(faces).reshape(-1, 3))
-    except (OSError, ValueError, IndexError) as error:
-        raise RtgsError(f"{path} is not a readable OBJ: {error}") from error
+        mesh = TriangleMesh(np.array(vertices).reshape(-1, 3), np.array(faces, np.int64).reshape(-1, 3))
+    except (OSError, ValueError, IndexError, OverflowError) as error:
+        raise RtgsError(f"{path} is not a readable OBJ: {str(error)[:200]}") from error
     if len(mesh.faces) == 0:
         raise RtgsError(f"{path} holds no faces; is it a point cloud?")
     return mesh

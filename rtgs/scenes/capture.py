@@ -13,6 +13,8 @@ from rtgs.core.names import path_inside
 from rtgs.scenes.settings import CaptureError
 from rtgs.scenes.undistort import Lens
 
+_LONGEST_ITEM = 240  # characters of a name in a message
+
 
 @dataclass(frozen=True)
 class Finding:
@@ -49,7 +51,8 @@ class CaptureView:
     @property
     def center(self) -> np.ndarray:
         """(3,) camera centre in the world frame."""
-        return -self.rotation.T @ self.translation
+        with np.errstate(over="ignore", invalid="ignore"):  # poses are judged by rtgs.scenes.findings
+            return -self.rotation.T @ self.translation
 
 
 @dataclass(frozen=True)
@@ -101,8 +104,8 @@ def existing_side_file(folder: Path, image_name: str, suffixes: Sequence[str]) -
 
 
 def list_some(items: Iterable[object], limit: int = 20) -> str:
-    """A comma-separated list for messages; the tail is counted."""
-    items = [str(item) for item in items]
+    """A comma-separated list for messages; the tail is counted, and what is very long is cut."""
+    items = [text if len(text) <= _LONGEST_ITEM else f"{text[:_LONGEST_ITEM]}..." for text in map(str, items)]
     tail = f", and {len(items) - limit} more" if len(items) > limit else ""
     return ", ".join(items[:limit]) + tail
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from rtgs.scenes.capture import Capture, CaptureView, Finding, list_some
-from rtgs.scenes.findings import capture_findings, finite_views
+from rtgs.scenes.findings import capture_findings, placed_views
 from rtgs.scenes.images import (
     MASK_SUFFIXES,
     NORMAL_SUFFIXES,
@@ -21,7 +21,7 @@ from rtgs.scenes.images import (
     same_aspect,
 )
 from rtgs.scenes.importers.registry import read_capture
-from rtgs.scenes.points import camera_extent, filter_points, too_few_points
+from rtgs.scenes.points import camera_extent, filter_points, random_points, too_few_points
 from rtgs.scenes.settings import CaptureError, SceneSettings
 from rtgs.scenes.splits import Split, choose_split
 
@@ -90,12 +90,12 @@ def _side_images(kind: str, capture: Capture, settings: SceneSettings) -> Iterat
         if not path.is_file():
             continue  # reported by capture_findings
         try:
-            pixels = read_mask(path) if masks else read_normals(path, settings.normals_frame)
+            photo = _photo_size(view)
+            pixels = read_mask(path, photo) if masks else read_normals(path, settings.normals_frame, photo)
         except CaptureError as error:
             yield Finding("error", str(error), str(path))
             continue
         size = (pixels.shape[1], pixels.shape[0])
-        photo = _photo_size(view)
         if photo and not same_aspect(size, photo):
             what = f"{kind} of {size[0]}x{size[1]} pixels for a photo of {photo[0]}x{photo[1]}"
             yield Finding("error", what, str(path), f"make the {kind} from this very photo")
@@ -129,7 +129,7 @@ def _orphans(kind: str, capture: Capture, settings: SceneSettings, used: set[Pat
 
 
 def _splits_and_points(capture: Capture, settings: SceneSettings) -> Iterator[Finding]:
-    views = finite_views(capture)
+    views = placed_views(capture)
     if len({view.name for view in views}) < 2:
         return  # reported by capture_findings
     try:
@@ -144,11 +144,25 @@ def _splits_and_points(capture: Capture, settings: SceneSettings) -> Iterator[Fi
         return
     if capture.points is not None and settings.points != "random":
         yield from _points(capture, settings, views, extent)
+    else:
+        yield from _random_points(capture, settings, views, extent)
 
 
 def _centers(views: list[CaptureView], split: Split) -> np.ndarray:
     training = set(split.train)
     return np.array([view.center for view in views if view.name in training]).reshape(-1, 3)
+
+
+def _random_points(
+    capture: Capture, settings: SceneSettings, views: list[CaptureView], extent: float
+) -> Iterator[Finding]:
+    """Whether enough of the points that will be drawn can be used."""
+    centers, axes = np.array([view.center for view in views]), np.array([view.rotation[2] for view in views])
+    drawn = random_points(capture, centers, axes, settings)
+    result = filter_points(drawn, centers, extent, settings.near_camera, settings.far_factor)
+    problem = too_few_points(len(result.points), len(drawn), drawn.source, settings.min_points)
+    if problem:
+        yield Finding("error", problem, str(capture.root))
 
 
 def _points(capture: Capture, settings: SceneSettings, views: list[CaptureView], extent: float) -> Iterator[Finding]:

@@ -12,6 +12,7 @@ from rtgs.scenes.undistort import check_lens
 
 _FEW_VIEWS = 8
 _FAR_CAMERA = 50.0  # times the median distance of the cameras to their median
+_FARTHEST = 1e9  # units of the capture; float32 could not tell its views apart
 _FOCAL_RATIO = 4.0  # between the longest and the shortest focal length, in image widths
 
 
@@ -31,6 +32,11 @@ def capture_findings(capture: Capture) -> list[Finding]:
 def finite_views(capture: Capture) -> list[CaptureView]:
     """The views whose pose holds no NaN or inf."""
     return [v for v in capture.views if np.isfinite(v.rotation).all() and np.isfinite(v.translation).all()]
+
+
+def placed_views(capture: Capture) -> list[CaptureView]:
+    """The views that stand somewhere in reach."""
+    return [view for view in finite_views(capture) if np.abs(view.center).max() < _FARTHEST]
 
 
 def missing_files(capture: Capture) -> list[Finding]:
@@ -83,6 +89,11 @@ def _poses(capture: Capture) -> list[Finding]:
     if broken:
         what = f"the poses of {len(broken)} images hold NaN or inf: {list_some(broken)}"
         findings.append(Finding("error", what, where, "remove these images from the model or register them again"))
+    placed = {id(view) for view in placed_views(capture)}
+    far = [view.name for view in finite if id(view) not in placed]
+    if far:
+        what = f"{len(far)} images were taken from beyond {_FARTHEST:g}: {list_some(far)}"
+        findings.append(Finding("error", what, where, "remove these images from the model or register them again"))
     skewed = [view.name for view in finite if not _is_rotation(view.rotation)]
     if skewed:
         what = f"the poses of {len(skewed)} images are no rotations (scaled, skewed or mirrored): {list_some(skewed)}"
@@ -91,7 +102,8 @@ def _poses(capture: Capture) -> list[Finding]:
 
 
 def _is_rotation(matrix: np.ndarray) -> bool:
-    return bool(np.abs(matrix @ matrix.T - np.eye(3)).max() < 1e-2 and np.linalg.det(matrix) > 0)
+    with np.errstate(over="ignore", invalid="ignore"):
+        return bool(np.abs(matrix @ matrix.T - np.eye(3)).max() < 1e-2 and np.linalg.det(matrix) > 0)
 
 
 def _lenses(capture: Capture) -> list[Finding]:
@@ -122,7 +134,7 @@ def _view_count(capture: Capture) -> list[Finding]:
 
 def _scales(capture: Capture) -> list[Finding]:
     findings, where = [], str(capture.model_files[0])
-    views = finite_views(capture)
+    views = placed_views(capture)
     if len(views) >= 4:
         centers = np.array([view.center for view in views])
         distance = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)

@@ -3,20 +3,37 @@
 from __future__ import annotations
 
 import math
+import struct
 import warnings
+import zlib
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageOps
+from PIL import Image
 
+from rtgs.core.arrays import ArrayFileError, read_npy
+from rtgs.scenes.exif import read_exif
 from rtgs.scenes.settings import CaptureError, SceneSettings
+from rtgs.scenes.undistort import ENLARGED
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
 MASK_SUFFIXES = (".png", ".PNG", ".jpg", ".JPG")
 NORMAL_SUFFIXES = (".png", ".npy")
-_ORIENTATION_TAG = 0x0112
 _SWAPPING_ORIENTATIONS = (5, 6, 7, 8)
-_READ_ERRORS = (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError)
+_LONGEST_NORMAL = 1e6  # unit vectors; some tools leave them as they were before they were normalised
+_FORMATS = ("JPEG", "MPO", "PNG", "TIFF", "WEBP", "BMP", "GIF", "PPM", "HEIF", "AVIF")
+_SMALL_SIDE = 2048  # pixels; below it nothing is too large
+_MOST_PIXELS = 150_000_000  # decoded and as floats a picture takes 15 bytes a pixel
+READ_ERRORS = (
+    OSError, SyntaxError, ValueError, TypeError, LookupError, EOFError, OverflowError, MemoryError, AttributeError,
+    struct.error, zlib.error, Image.DecompressionBombError,
+)  # fmt: skip
+"""What Pillow raises on damaged pictures."""
+_TURNS = {
+    2: (Image.Transpose.FLIP_LEFT_RIGHT,), 3: (Image.Transpose.ROTATE_180,), 4: (Image.Transpose.FLIP_TOP_BOTTOM,),
+    5: (Image.Transpose.TRANSPOSE,), 6: (Image.Transpose.ROTATE_270,), 7: (Image.Transpose.TRANSVERSE,),
+    8: (Image.Transpose.ROTATE_90,),
+}  # fmt: skip
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -43,11 +60,12 @@ def read_photo(
         CaptureError: missing, truncated, zero-sized or unreadable file, or samples outside 0..1 in a float image.
     """
     with _open(path) as picture:
+        _refuse_unfitting(picture.size, expected, path, "photo")
         try:
             picture.load()
             picture = _turned_if_needed(picture, expected)
             pixels = _to_float(picture, path)
-        except _READ_ERRORS as error:
+        except READ_ERRORS as error:
             raise _unreadable(path, error) from error
     if pixels.shape[2] == 4:
         alpha = pixels[..., 3:]
@@ -61,14 +79,16 @@ def has_alpha(path: Path) -> bool:
         return _has_alpha(picture)
 
 
-def read_mask(path: Path) -> np.ndarray:
+def read_mask(path: Path, expected: tuple[int, int] | None = None) -> np.ndarray:
     """Read a mask as (H, W) bool: True where any colour channel is non-zero and alpha, if any, is not zero. Of a JPEG,
-    whose black is not exact: where a channel is at least half of white.
+    whose black is not exact: where a channel is at least half of white. ``expected`` is the photo's (width, height):
+    what is very much larger is refused before it is decoded.
 
     Raises:
         CaptureError: as :func:`read_photo`.
     """
     with _open(path) as picture:
+        _refuse_unfitting(picture.size, expected, path, "mask")
         lossy = picture.format in ("JPEG", "MPO")
         try:
             picture.load()
@@ -76,7 +96,7 @@ def read_mask(path: Path) -> np.ndarray:
                 pixels = np.asarray(picture.convert("RGBA"))
             else:
                 pixels = np.asarray(picture.convert("RGB") if picture.mode in ("P", "CMYK", "YCbCr") else picture)
-        except _READ_ERRORS as error:
+        except READ_ERRORS as error:
             raise _unreadable(path, error) from error
     if lossy:
         pixels = pixels > 127
@@ -86,16 +106,22 @@ def read_mask(path: Path) -> np.ndarray:
     return mask & (pixels[..., 3] != 0) if pixels.shape[2] == 4 else mask
 
 
-def read_normals(path: Path, frame: str = "opencv") -> np.ndarray:
+def read_normals(path: Path, frame: str = "opencv", expected: tuple[int, int] | None = None) -> np.ndarray:
     """Read a normal map as (H, W, 3) float32 unit vectors in the camera frame (x right, y down, z forward).
 
     ``.png`` holds (n + 1) / 2, ``.npy`` the vectors, (H, W, 3) or (3, H, W). Vectors shorter than 0.5 mean "unknown"
-    and become zero. ``frame`` "opengl" turns y and z of files with x right, y up, z backward.
+    and become zero. ``frame`` "opengl" turns y and z of files with x right, y up, z backward. ``expected`` as of
+    :func:`read_mask`.
 
     Raises:
         CaptureError: unreadable file, wrong shape, NaN.
     """
-    normals = _read_normal_array(path) if path.suffix.lower() == ".npy" else 2 * read_photo(path) - 1
+    if path.suffix.lower() == ".npy":
+        normals = _read_normal_array(path)
+    else:
+        if expected is not None:
+            _refuse_unfitting(image_size(path), expected, path, "normal map")
+        normals = 2 * read_photo(path) - 1
     if frame == "opengl":
         normals = normals * np.asarray([1, -1, -1], dtype=np.float32)
     return unit_or_zero(normals)
@@ -103,18 +129,20 @@ def read_normals(path: Path, frame: str = "opencv") -> np.ndarray:
 
 def _read_normal_array(path: Path) -> np.ndarray:
     try:
-        normals = np.load(path, allow_pickle=False)
-    except _READ_ERRORS as error:
-        raise _unreadable(path, error) from error
+        normals = read_npy(path)
+    except (ArrayFileError, OSError) as error:
+        raise CaptureError(f"normal map {path} cannot be read ({error}): write it again or remove it") from error
     if normals.ndim == 3 and normals.shape[0] == 3 and normals.shape[2] != 3:
         normals = np.moveaxis(normals, 0, -1)
-    if normals.ndim != 3 or normals.shape[2] != 3 or not np.issubdtype(normals.dtype, np.floating):
+    if normals.ndim != 3 or normals.shape[2] != 3 or not normals.size or not np.issubdtype(normals.dtype, np.floating):
         raise CaptureError(
             f"normal map {path} has shape {normals.shape} and type {normals.dtype}: "
-            "store floats of shape (H, W, 3) or (3, H, W)"
+            "store floats, at least one pixel of them, of shape (H, W, 3) or (3, H, W)"
         )
     if not np.isfinite(normals).all():
         raise CaptureError(f"normal map {path} holds NaN or inf: write zero vectors where the normal is unknown")
+    if float(np.abs(normals).max()) > _LONGEST_NORMAL:
+        raise CaptureError(f"normal map {path} holds vectors longer than {_LONGEST_NORMAL:g}: write it again")
     return normals.astype(np.float32)
 
 
@@ -167,13 +195,59 @@ def _open(path: Path) -> Image.Image:
     if path.stat().st_size == 0:
         raise CaptureError(f"image {path} is an empty file (0 bytes): copy it again or remove it from the capture")
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # photos of 100 megapixels are ordinary
-            picture = Image.open(path)
-    except _READ_ERRORS as error:
+        picture = open_picture(path)
+    except READ_ERRORS as error:
         raise _unreadable(path, error) from error
     if min(picture.size) < 1:
         raise CaptureError(f"image {path} has zero size {picture.size[0]}x{picture.size[1]}: write it again")
+    refuse_pixels(picture.size, path)
+    return picture
+
+
+def open_picture(path: Path) -> Image.Image:
+    """Pillow's picture, its pixels not yet read. Formats of photos only: others, PostScript among them, run programs.
+
+    Raises:
+        one of READ_ERRORS: no such picture.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # photos of 100 megapixels are ordinary
+        Image.init()
+        return Image.open(path, formats=[name for name in _FORMATS if name in Image.OPEN])
+
+
+def refuse_pixels(size: tuple[int, int], path: Path) -> None:
+    """Refuse what would take gigabytes, before it is decoded.
+
+    Raises:
+        CaptureError: more pixels than any photo has.
+    """
+    if size[0] * size[1] > _MOST_PIXELS:
+        raise CaptureError(
+            f"image {path} has {size[0]}x{size[1]} pixels, at most {_MOST_PIXELS:,} are read: shrink it, or take it out"
+        )
+
+
+def _refuse_unfitting(size: tuple[int, int], expected: tuple[int, int] | None, path: Path, kind: str) -> None:
+    """Refuse by the header what is much larger than its camera's pictures, or than a screen's where these are small.
+
+    Raises:
+        CaptureError: names both sizes.
+    """
+    if expected is None:
+        return
+    most = max(ENLARGED * max(expected), _SMALL_SIDE)
+    if max(size) > most:
+        raise CaptureError(
+            f"{kind} {path} is {size[0]}x{size[1]}, the camera's pictures {expected[0]}x{expected[1]}: a copy may be "
+            f"up to {ENLARGED:g} times larger; make it from this very photo"
+        )
+
+
+def turned_upright(picture: Image.Image, orientation: int) -> Image.Image:
+    """A picture as EXIF's orientation (1 to 8) says it is to be seen."""
+    for turn in _TURNS.get(orientation, ()):
+        picture = picture.transpose(turn)
     return picture
 
 
@@ -192,11 +266,11 @@ def _has_alpha(picture: Image.Image) -> bool:
 
 
 def _turned_if_needed(picture: Image.Image, expected: tuple[int, int] | None) -> Image.Image:
-    swapping = picture.getexif().get(_ORIENTATION_TAG) in _SWAPPING_ORIENTATIONS
-    if expected is None or not swapping or same_aspect(picture.size, expected):
+    turn = read_exif(picture).orientation
+    if expected is None or turn not in _SWAPPING_ORIENTATIONS or same_aspect(picture.size, expected):
         return picture
     turned_size = (picture.size[1], picture.size[0])
-    return ImageOps.exif_transpose(picture) if same_aspect(turned_size, expected) else picture
+    return turned_upright(picture, turn) if same_aspect(turned_size, expected) else picture
 
 
 def _to_float(picture: Image.Image, path: Path) -> np.ndarray:

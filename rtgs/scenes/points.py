@@ -10,6 +10,7 @@ from rtgs.scenes.capture import Capture, PointCloud
 from rtgs.scenes.settings import CaptureError, SceneSettings
 
 _FAR_PERCENTILE = 90.0
+_LARGEST = 1e18  # its square is a float32
 _FAR_LEAST_POINTS = 20  # fewer points have no meaningful percentile
 
 
@@ -57,11 +58,11 @@ def filter_points(
 ) -> PointFilter:
     """Drop points no surfel can start from. The order of the others is kept.
 
-    Dropped are: non-finite positions or colours; exact copies of an earlier position (their nearest-neighbour distance
-    of zero would make the initial scale vanish); points within ``near_camera`` * ``extent`` of a camera centre
-    (method.md 13: they cover every pixel); points farther from the mean camera than ``far_factor`` times the 90th
-    percentile of that distance (mis-triangulated: true backgrounds lie within a few times that percentile), if there
-    are at least 20 points.
+    Dropped are: positions or colours that are not finite, or not in float32; exact copies of an earlier position
+    (their nearest-neighbour distance of zero would make the initial scale vanish); points within ``near_camera`` *
+    ``extent`` of a camera centre (method.md 13: they cover every pixel); points farther from the mean camera than
+    ``far_factor`` times the 90th percentile of that distance (mis-triangulated: true backgrounds lie within a few
+    times that percentile), if there are at least 20 points.
 
     Args:
         points: the capture's points, world frame.
@@ -70,7 +71,8 @@ def filter_points(
         near_camera: radius around cameras, in extents.
         far_factor: 0 keeps all far points.
     """
-    finite = np.asarray(np.isfinite(np.concatenate([points.positions, points.colors], axis=1)).all(axis=1))
+    whole = np.isfinite(np.concatenate([points.positions, points.colors], axis=1)).all(axis=1)
+    finite = np.asarray(whole & (np.abs(points.positions) < _LARGEST).all(axis=1))
     kept = points.select(finite)
     _, first = np.unique(kept.positions, axis=0, return_index=True)
     unique = kept.select(np.sort(first))

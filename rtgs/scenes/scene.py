@@ -136,7 +136,10 @@ def load_scene(settings: SceneSettings) -> Scene:
     views = select_views(capture, settings)
     split = choose_split(capture, [view.name for view in views], settings)
     by_name = {view.name: view for view in views}
-    extent = camera_extent(np.array([by_name[name].center for name in split.train]).reshape(-1, 3))
+    try:
+        extent = camera_extent(np.array([by_name[name].center for name in split.train]).reshape(-1, 3))
+    except CaptureError as error:
+        raise CaptureError(f"capture {capture.root}: {error}") from error
     used = [by_name[name] for name in (*split.train, *split.test)]
     points, point_source = _scene_points(capture, settings, used, extent)
     record = CaptureRecord.read(capture.root)
@@ -214,7 +217,7 @@ def _camera(view: CaptureView, pinhole: Lens) -> Camera:
 
 def _load_mask(view: CaptureView, lens: Lens, width: int, height: int) -> Tensor:
     assert view.mask is not None
-    mask = read_mask(view.mask)
+    mask = read_mask(view.mask, (lens.width, lens.height))
     _check_side_size("mask", view, mask, lens)
     full = nearest_resize(mask, lens.width, lens.height)
     return torch.from_numpy(nearest_resize(undistort_nearest(full, lens), width, height).copy())
@@ -223,7 +226,7 @@ def _load_mask(view: CaptureView, lens: Lens, width: int, height: int) -> Tensor
 def _load_normal(view: CaptureView, lens: Lens, width: int, height: int, frame: str) -> Tensor:
     """Normals are averaged like colours, then normalised. Undistortion keeps the camera's axes, so vectors stay."""
     assert view.normal is not None
-    normal = read_normals(view.normal, frame)
+    normal = read_normals(view.normal, frame, (lens.width, lens.height))
     _check_side_size("normal map", view, normal, lens)
     if not lens.is_pinhole and normal.shape[:2] != (lens.height, lens.width):
         normal = unit_or_zero(_enlarge(normal, lens.width, lens.height))

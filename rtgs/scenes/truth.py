@@ -23,7 +23,7 @@ import torch
 from PIL import Image, PngImagePlugin
 from torch import Tensor
 
-from rtgs.scenes.images import nearest_resize
+from rtgs.scenes.images import READ_ERRORS, nearest_resize, open_picture, refuse_pixels
 from rtgs.scenes.settings import CaptureError
 from rtgs.scenes.truth_files import GLASS_MAPS, truth_files
 
@@ -195,10 +195,11 @@ def _light(path: Path, pixels: np.ndarray, scale: str | None) -> np.ndarray:
 
 def _load(path: Path) -> tuple[np.ndarray, str | None]:
     try:
-        with Image.open(path) as picture:
+        with open_picture(path) as picture:
+            refuse_pixels(picture.size, path)
             picture.load()
             return np.asarray(picture), getattr(picture, "text", {}).get("scale")
-    except (OSError, SyntaxError, ValueError) as error:
+    except READ_ERRORS as error:
         raise CaptureError(
             f"truth {path} cannot be read ({error}): restore the file, make the capture again, or remove the truth "
             "folder"
@@ -207,6 +208,9 @@ def _load(path: Path) -> tuple[np.ndarray, str | None]:
 
 def _scale(path: Path, text: str | None) -> float:
     try:
-        return float(text or "")
+        scale = float(text or "")
     except ValueError as error:
         raise CaptureError(f"truth {path} has no scale in its text chunk ({text!r}): make the capture again") from error
+    if not 0 < scale < 1e6:
+        raise CaptureError(f"truth {path} has the scale {scale:g} in its text chunk: make the capture again")
+    return scale

@@ -178,7 +178,7 @@ def undistorted_lens(lens: Lens) -> Lens:
     try:
         target = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
     except (RuntimeError, ValueError) as error:
-        raise CaptureError(f"camera {lens.model} {lens.params} cannot be undistorted: {error}") from error
+        raise CaptureError(f"camera {lens.model} {lens.params} cannot be undistorted: {str(error)[:200]}") from error
     params = tuple(float(p) for p in target.params)
     if target.model_name not in ("PINHOLE", "SIMPLE_PINHOLE") or not np.isfinite(params).all():
         raise CaptureError(
@@ -203,10 +203,11 @@ def undistortion_map(lens: Lens) -> np.ndarray:
     result = np.empty((2, target.height, target.width), dtype=np.float32)
     ray = np.ones((target.width, 3))
     ray[:, 0] = x
-    for row in range(target.height):
-        ray[:, 1] = (row + 0.5 - cy) / fy
-        result[:, row] = np.asarray(camera.img_from_cam(ray)).T - 0.5
-    bad_share = 1 - float(_valid(result, lens).mean())
+    with np.errstate(over="ignore", invalid="ignore"):  # what lies beyond float32 is not valid
+        for row in range(target.height):
+            ray[:, 1] = (row + 0.5 - cy) / fy
+            result[:, row] = np.asarray(camera.img_from_cam(ray)).T - 0.5
+        bad_share = 1 - float(_valid(result, lens).mean())
     if not bad_share <= _MAX_OUTSIDE_SHARE:
         raise CaptureError(
             f"camera {lens.model} {lens.params}: {bad_share:.1%} of the undistorted pixels fall outside the "
@@ -270,7 +271,9 @@ def _colmap_camera(lens: Lens) -> Any:
     try:
         camera = pycolmap.Camera(model=lens.model, width=lens.width, height=lens.height, params=list(lens.params))
     except (RuntimeError, ValueError, TypeError) as error:
-        raise CaptureError(f"camera model {lens.model!r} with parameters {lens.params}: {error}") from error
+        raise CaptureError(
+            f"camera model {shown(lens.model)} with parameters {shown(lens.params)}: {str(error)[:200]}"
+        ) from error
     if not camera.verify_params():
         raise CaptureError(f"camera model {lens.model} takes {camera.params_info}, got {len(lens.params)} numbers")
     return camera

@@ -73,13 +73,13 @@ def read_drawing(path: Path, views: Iterable[str]) -> Drawing:
     names = tuple(views)
     panes = {
         str(pane): {
-            _photo(path, photo, names): _points(path, f"pane {pane}, {photo}", corners, least=3)
-            for photo, corners in _mapping(path, f"panes.{pane}", photos).items()
+            _photo(path, photo, names): _points(path, f"pane {str(pane)[:80]}, {str(photo)[:80]}", corners, least=3)
+            for photo, corners in _mapping(path, f"panes.{str(pane)[:80]}", photos).items()
         }
         for pane, photos in _mapping(path, "panes", content.get("panes") or {}).items()
     }
     cutouts = {
-        _photo(path, photo, names): _cutout(path, str(photo), marks)
+        _photo(path, photo, names): _cutout(path, str(photo)[:80], marks)
         for photo, marks in _mapping(path, "cutouts", content.get("cutouts") or {}).items()
     }
     for pane, photos in panes.items():
@@ -87,8 +87,8 @@ def read_drawing(path: Path, views: Iterable[str]) -> Drawing:
         if len(counts) > 1:
             listed = list_some(f"{name}: {len(corners)}" for name, corners in sorted(photos.items()))
             raise PrepareError(
-                f"{path}: pane {pane} has different numbers of corners ({listed}): draw the same corners in the same "
-                "order in every photo; a corner outside a photo may have coordinates outside it"
+                f"{path}: pane {pane[:80]} has different numbers of corners ({listed}): draw the same corners in the "
+                "same order in every photo; a corner outside a photo may have coordinates outside it"
             )
     drawing = Drawing(path, units == "fraction", panes, cutouts)
     if not drawing.marked:
@@ -142,10 +142,10 @@ def _photo(path: Path, named: object, views: tuple[str, ...]) -> str:
     if len(fitting) == 1:
         return fitting[0]
     if fitting:
-        raise PrepareError(f"{path}: {text} could be any of {list_some(fitting, 4)}: name it with its sub-folder")
+        raise PrepareError(f"{path}: {text[:80]} could be any of {list_some(fitting, 4)}: name it with its sub-folder")
     close = difflib.get_close_matches(text, views, n=1)
     hint = f"did you mean {close[0]}?" if close else f"there are {list_some(views, 4)}"
-    raise PrepareError(f"{path}: no photo {text} with a pose in the capture; {hint}")
+    raise PrepareError(f"{path}: no photo {text[:80]} with a pose in the capture; {hint}")
 
 
 def _points(path: Path, where: str, value: object, least: int = 0) -> np.ndarray:

@@ -14,18 +14,24 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageOps
+from PIL import Image
 
 from rtgs.prepare.errors import PrepareError
 from rtgs.prepare.masks.settings import GivenSettings, parse_color
 from rtgs.scenes.capture import CaptureView, existing_side_file, list_some
-from rtgs.scenes.images import MASK_SUFFIXES, same_aspect
+from rtgs.scenes.exif import read_exif
+from rtgs.scenes.images import (
+    MASK_SUFFIXES,
+    READ_ERRORS,
+    open_picture,
+    refuse_pixels,
+    same_aspect,
+    turned_upright,
+)
 from rtgs.scenes.settings import CaptureError
 
 _SUFFIXES = (*MASK_SUFFIXES, ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".gif")
 _LOSSY = (".jpg", ".jpeg", ".webp")
-_ORIENTATION = 0x0112
-_READ_ERRORS = (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError)
 
 
 def given_files(views: Sequence[CaptureView], folder: Path, given: GivenSettings) -> dict[str, Path]:
@@ -74,7 +80,7 @@ def read_given(path: Path, view: CaptureView, given: GivenSettings) -> np.ndarra
     with _opened(path) as picture:
         try:
             picture.load()
-        except _READ_ERRORS as error:
+        except READ_ERRORS as error:
             raise CaptureError(f"mask {path} cannot be read ({error}): write it again or remove it") from error
         inside = _inside(picture, path, given)
     inside = _upright(inside, path, view)
@@ -83,8 +89,10 @@ def read_given(path: Path, view: CaptureView, given: GivenSettings) -> np.ndarra
 
 def _opened(path: Path) -> Image.Image:
     try:
-        return Image.open(path)
-    except _READ_ERRORS as error:
+        picture = open_picture(path)
+        refuse_pixels(picture.size, path)
+        return picture
+    except READ_ERRORS as error:
         raise CaptureError(f"mask {path} cannot be read ({error}): write it again or remove it") from error
 
 
@@ -128,11 +136,9 @@ def _upright(inside: np.ndarray, path: Path, view: CaptureView) -> np.ndarray:
     if same_aspect(size, wanted):
         return inside
     if same_aspect(size[::-1], wanted):
-        orientation = _orientation(path) or _orientation(view.image)
+        orientation = max(_orientation(path), _orientation(view.image), key=lambda turn: turn in (5, 6, 7, 8))
         if orientation in (5, 6, 7, 8):
-            turned = Image.fromarray(inside.astype(np.uint8))
-            turned.getexif()[_ORIENTATION] = orientation
-            return np.asarray(ImageOps.exif_transpose(turned)) != 0
+            return np.asarray(turned_upright(Image.fromarray(inside.astype(np.uint8)), orientation)) != 0
     raise PrepareError(
         f"mask {path} is {size[0]}x{size[1]}, its photo {view.name} {wanted[0]}x{wanted[1]}: any size will do, but the "
         "aspect ratios differ; make the mask from this very photo"
@@ -141,4 +147,4 @@ def _upright(inside: np.ndarray, path: Path, view: CaptureView) -> np.ndarray:
 
 def _orientation(path: Path) -> int:
     with _opened(path) as picture:
-        return int(picture.getexif().get(_ORIENTATION, 0))
+        return read_exif(picture).orientation

@@ -9,22 +9,31 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageOps
+from PIL import Image
 
 from rtgs.core.names import path_inside
 from rtgs.prepare.errors import PrepareError
 from rtgs.scenes.capture import Finding, existing_side_file, list_some
 from rtgs.scenes.digest import content_hash
-from rtgs.scenes.images import IMAGE_SUFFIXES, MASK_SUFFIXES, nearest_resize, read_mask, read_photo, same_aspect
+from rtgs.scenes.exif import EXIF_ERRORS, ORIENTATION, read_exif
+from rtgs.scenes.images import (
+    IMAGE_SUFFIXES,
+    MASK_SUFFIXES,
+    READ_ERRORS,
+    nearest_resize,
+    open_picture,
+    read_mask,
+    read_photo,
+    refuse_pixels,
+    same_aspect,
+    turned_upright,
+)
 from rtgs.scenes.importers.colmap import IMAGE_FOLDERS
 from rtgs.scenes.settings import CaptureError
 
 HEIC_SUFFIXES = (".heic", ".heif")
 RAW_SUFFIXES = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
-_EXIF_IFD = 0x8769
-_MAKE, _MODEL, _ORIENTATION = 0x010F, 0x0110, 0x0112
-_FOCAL, _FOCAL_35MM = 0x920A, 0xA405
 _PLAIN = (".jpg", ".jpeg", ".png")  # read by COLMAP as they are
 _JPEG_QUALITY = 97  # of photos that must be written anew: turned, HEIC, TIFF ...
 
@@ -149,19 +158,17 @@ def _inspect(path: Path, folder: Path, taken: set[str]) -> Photo:
     if path.stat().st_size == 0:
         raise PrepareError(f"{relative}: an empty file (0 bytes)")
     try:
-        with Image.open(path) as picture:
-            exif = picture.getexif()
-            size, turn = picture.size, exif.get(_ORIENTATION, 1)
-            details = exif.get_ifd(_EXIF_IFD)
+        with open_picture(path) as picture:
+            size, exif = picture.size, read_exif(picture)
+            refuse_pixels(size, path)
             picture.draft("RGB", (size[0] // 8, size[1] // 8))  # JPEG: an eighth is enough to see a broken file
             picture.load()
-    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:
+    except READ_ERRORS as error:
         raise PrepareError(f"{relative}: {str(error).replace(str(path), relative.name)}") from error
     if min(size) < 32:
         raise PrepareError(f"{relative}: {size[0]}x{size[1]} pixels are no photo")
-    focal = details.get(_FOCAL_35MM) or details.get(_FOCAL)
-    known = [str(exif.get(tag, "")).strip("\0 ") for tag in (_MAKE, _MODEL)]
-    camera = " ".join([*filter(None, known), f"{float(focal):g} mm"]) if focal else ""
+    turn = exif.orientation
+    camera = " ".join([*filter(None, [exif.camera]), f"{exif.focal:g} mm"]) if exif.focal else ""
     width, height = size[::-1] if turn in (5, 6, 7, 8) else size
     plain = path.suffix.lower() in _PLAIN
     name = relative.as_posix() if plain else relative.with_suffix(".jpg").as_posix()
@@ -169,7 +176,7 @@ def _inspect(path: Path, folder: Path, taken: set[str]) -> Photo:
     if name in taken:
         name = re.sub(r"\s", "_", f"{relative.as_posix()}.{len(taken)}{'' if plain else '.jpg'}")
         name = f"{name}{path.suffix}" if plain else name
-    return Photo(path, name, width, height, turn not in (0, 1), camera)
+    return Photo(path, name, width, height, turn != 1, camera)
 
 
 def _without_twins(photos: list[Photo]) -> tuple[list[Photo], list[tuple[str, str]]]:
@@ -245,25 +252,34 @@ def _lay_out_one(photo: Photo, place: Path, background: tuple[float, float, floa
     path = photo.path
     if path.suffix.lower() in HEIC_SUFFIXES:
         open_heic()
-    with Image.open(path) as picture:
+    with open_picture(path) as picture:
         mode = picture.mode
         if path.suffix.lower() in _PLAIN and not photo.turned and mode in ("RGB", "L"):
             return _link(path, place)
-        exif = picture.getexif()
+        turn, tags = read_exif(picture).orientation, _upright_exif(picture, path)
         if mode in ("RGB", "L"):
-            upright = ImageOps.exif_transpose(picture).convert("RGB")
+            upright = turned_upright(picture, turn).convert("RGB")
         else:
             pixels = np.round(read_photo(path, background) * 255).astype(np.uint8)
-            upright = Image.fromarray(pixels)
-            if photo.turned:
-                upright.getexif()[_ORIENTATION] = exif.get(_ORIENTATION, 1)
-                upright = ImageOps.exif_transpose(upright)
-    exif[_ORIENTATION] = 1
+            upright = turned_upright(Image.fromarray(pixels), turn)
     partial = place.with_name(f"{place.name}.part")
     kind = "PNG" if place.suffix.lower() == ".png" else "JPEG"
-    upright.save(partial, kind, exif=exif.tobytes(), quality=_JPEG_QUALITY)
+    upright.save(partial, kind, exif=tags, quality=_JPEG_QUALITY)
     partial.replace(place)
     return None
+
+
+def _upright_exif(picture: Image.Image, path: Path) -> bytes:
+    """What a photo's EXIF says, for the same photo turned upright."""
+    try:
+        exif = picture.getexif()
+        exif[ORIENTATION] = 1
+        return exif.tobytes()
+    except EXIF_ERRORS as error:
+        raise PrepareError(
+            f"{path} has EXIF that cannot be carried over ({error}): remove it (exiftool -all=), or export the photo "
+            "again"
+        ) from error
 
 
 def _link(source: Path, place: Path) -> None:
@@ -315,8 +331,7 @@ def fitted_mask(path: Path, photo: Photo) -> np.ndarray:
                 f"mask {path} is {size[0]}x{size[1]}, its photo {photo.name} {photo.width}x{photo.height}: the aspect "
                 "ratios differ; make the mask from this very photo"
             )
-        with Image.open(photo.path) as picture:
-            turned = Image.fromarray(mask.astype(np.uint8))
-            turned.getexif()[_ORIENTATION] = picture.getexif().get(_ORIENTATION, 1)
-        mask = np.asarray(ImageOps.exif_transpose(turned)) != 0
+        with open_picture(photo.path) as picture:
+            turn = read_exif(picture).orientation
+        mask = np.asarray(turned_upright(Image.fromarray(mask.astype(np.uint8)), turn)) != 0
     return nearest_resize(mask, photo.width, photo.height)

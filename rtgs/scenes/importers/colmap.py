@@ -67,8 +67,6 @@ def read_colmap(settings: SceneSettings, root: Path) -> Capture:
     if not registered:
         raise _no_images(folder)
     lenses = {key: _lens(camera, folder) for key, camera in model.cameras.items()}
-    for image in model.images.values():
-        refuse_name(image.name, folder, CaptureError)
     images_dir = find_images(root, settings.images_dir, [image.name for image in registered])
     views = tuple(_view(image, lenses[image.camera_id], images_dir, root, settings) for image in registered)
     unregistered = [image.name for image in model.images.values() if not image.has_pose]
@@ -97,7 +95,12 @@ def _read_model(folder: Path) -> Any:
     import pycolmap
 
     try:
-        return pycolmap.Reconstruction(str(folder))
+        model = pycolmap.Reconstruction(str(folder))
+        for image in model.images.values():
+            refuse_name(image.name, folder, CaptureError)  # pycolmap decodes it here
+        return model
+    except CaptureError:
+        raise
     except Exception as error:  # pycolmap raises whatever its C++ side threw: RuntimeError, ValueError, IndexError
         non_finite = _non_finite_lines(folder)
         if non_finite:

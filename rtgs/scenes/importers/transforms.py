@@ -13,8 +13,9 @@ import numpy as np
 
 from rtgs.core.documents import DocumentError, load_json
 from rtgs.core.names import path_inside
+from rtgs.core.ply_header import check_ply
 from rtgs.core.refuse import shown
-from rtgs.scenes.capture import Capture, CaptureView, Finding, PointCloud, existing_side_file
+from rtgs.scenes.capture import Capture, CaptureView, Finding, PointCloud, existing_side_file, list_some
 from rtgs.scenes.images import IMAGE_SUFFIXES, MASK_SUFFIXES, NORMAL_SUFFIXES, image_size
 from rtgs.scenes.settings import CaptureError, SceneSettings
 from rtgs.scenes.truth_files import existing_truth
@@ -25,6 +26,7 @@ _OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0])
 _RADIAL = ("k1", "k2", "p1", "p2")
 _FISHEYE = ("k1", "k2", "k3", "k4")
 _FULL = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_FARTHEST_POINTS = 1e9  # in the units of the capture
 _POLYNOMIAL_MODELS = ("OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 
 
@@ -84,11 +86,14 @@ def world_to_camera(matrix: object, where: str) -> tuple[np.ndarray, np.ndarray]
     try:
         pose = np.asarray(matrix, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise CaptureError(f"{where}: transform_matrix holds something that is no number ({error})") from error
+        raise CaptureError(
+            f"{where}: transform_matrix holds something that is no number ({str(error)[:200]})"
+        ) from error
     if pose.shape not in ((4, 4), (3, 4)):
         raise CaptureError(f"{where}: transform_matrix has shape {pose.shape}, expected 4x4 (OpenGL camera to world)")
-    rotation = _OPENGL_TO_OPENCV @ pose[:3, :3].T
-    return rotation, -rotation @ pose[:3, 3]
+    with np.errstate(over="ignore", invalid="ignore"):  # NaN and inf are found when poses are checked
+        rotation = _OPENGL_TO_OPENCV @ pose[:3, :3].T
+        return rotation, -rotation @ pose[:3, 3]
 
 
 def locate_image(root: Path, file_path: str, where: str) -> Path:
@@ -120,8 +125,8 @@ def _view(index: int, frame: Any, shared: dict[str, Any], settings: SceneSetting
     if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
         raise CaptureError(f"{where} has no file_path")
     if "transform_matrix" not in frame:
-        raise CaptureError(f"{where} ({frame['file_path']}) has no transform_matrix: export the poses again")
-    where = f"{where} ({frame['file_path']})"
+        raise CaptureError(f"{where} ({frame['file_path'][:80]}) has no transform_matrix: export the poses again")
+    where = f"{where} ({frame['file_path'][:80]})"
     root = path.parent
     name = frame["file_path"].removeprefix("./")
     image = locate_image(root, name, where)
@@ -214,7 +219,7 @@ def _distortion(keys: dict[str, Any], where: str) -> tuple[str, tuple[float, ...
         return "OPENCV_FISHEYE", values(_FISHEYE)
     if model not in _POLYNOMIAL_MODELS:
         raise CaptureError(
-            f"{where}: camera_model {keys.get('camera_model')!r} is not supported in transforms.json; "
+            f"{where}: camera_model {shown(keys.get('camera_model'))} is not supported in transforms.json; "
             "undistort the photos to PINHOLE, or import the COLMAP model instead"
         )
     full = values(_FULL)
@@ -237,19 +242,34 @@ def read_point_file(path: Path) -> PointCloud:
     Raises:
         CaptureError: not a PLY file, or one without x y z.
     """
-    from plyfile import PlyData, PlyElementParseError, PlyHeaderParseError
+    from plyfile import PlyData, PlyParseError
 
     try:
-        vertices = PlyData.read(str(path))["vertex"].data
-        positions = np.stack([np.asarray(vertices[axis], dtype=np.float64) for axis in "xyz"], axis=1)
-    except (PlyHeaderParseError, PlyElementParseError, KeyError, ValueError, OSError) as error:
+        check_ply(path)
+        with np.errstate(over="ignore"):  # numbers in text beyond their type become inf, and those points go
+            vertices = PlyData.read(str(path))["vertex"].data
+        positions = _float_columns(vertices, ("x", "y", "z"))
+    except (PlyParseError, LookupError, ValueError, TypeError, OSError, MemoryError, OverflowError) as error:
         raise CaptureError(f"point file {path} is no PLY file with x y z ({error}): export it again") from error
+    reach = np.abs(positions[np.isfinite(positions).all(axis=1)]).max(axis=1, initial=0)
+    if len(reach) and float(np.median(reach)) > _FARTHEST_POINTS:
+        raise CaptureError(
+            f"point file {path}: half of its points lie beyond {float(np.median(reach)):.3g}: its rows are not where "
+            "its header says; export it again"
+        )
     names = vertices.dtype.names or ()
     if not {"red", "green", "blue"} <= set(names):
         return PointCloud(positions, np.full_like(positions, 0.5), str(path))
-    raw = np.stack([np.asarray(vertices[channel]) for channel in ("red", "green", "blue")], axis=1)
-    colors = raw.astype(np.float64) / (1.0 if np.issubdtype(raw.dtype, np.floating) else 255.0)
+    try:
+        colors = _float_columns(vertices, ("red", "green", "blue"))
+    except (ValueError, TypeError) as error:
+        raise CaptureError(f"point file {path} has colours that are no numbers ({error}): export it again") from error
+    colors = colors / (1.0 if np.issubdtype(vertices["red"].dtype, np.floating) else 255.0)
     return PointCloud(positions, np.clip(colors, 0.0, 1.0), str(path))
+
+
+def _float_columns(rows: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
+    return np.stack([np.asarray(rows[name]).astype(np.float64) for name in names], axis=1)
 
 
 def _own_split(content: dict[str, Any], names: list[str], path: Path) -> dict[str, str]:
@@ -258,10 +278,13 @@ def _own_split(content: dict[str, Any], names: list[str], path: Path) -> dict[st
         return {}
     split = dict.fromkeys(names, "unused")
     for part in ("train", "test"):
-        listed = [str(name).removeprefix("./") for name in content[f"{part}_filenames"]]
+        stated = content[f"{part}_filenames"]
+        if not isinstance(stated, list):
+            raise CaptureError(f"{path}: {part}_filenames is {shown(stated)}, not a list of names")
+        listed = [str(name).removeprefix("./") for name in stated]
         unknown = sorted(set(listed) - set(names))
         if unknown:
-            raise CaptureError(f"{path}: {part}_filenames names images without a frame: {', '.join(unknown[:10])}")
+            raise CaptureError(f"{path}: {part}_filenames names images without a frame: {list_some(unknown, 10)}")
         split.update(dict.fromkeys(listed, part))
     return split
 

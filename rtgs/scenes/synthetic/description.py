@@ -125,7 +125,7 @@ def _build(cls: type[T], values: dict[str, Any], where: str) -> T:
     known = get_type_hints(cls)
     unknown = sorted(set(values) - set(known))
     if unknown:
-        raise ValueError(f"{where}: unknown key {unknown[0]!r}; known keys are {', '.join(sorted(known))}")
+        raise ValueError(f"{where}: unknown key {shown(unknown[0])}; known keys are {', '.join(sorted(known))}")
     for item in fields(cls):  # type: ignore[arg-type]
         if item.default is MISSING and item.default_factory is MISSING and item.name not in values:
             raise ValueError(f"{where}: the key {item.name!r} is missing")
@@ -238,7 +238,7 @@ def _check_viewpoints(viewpoints: Viewpoints, where: str) -> None:
 
 def _check_choice(value: str, allowed: tuple[str, ...], where: str) -> None:
     if value not in allowed:
-        raise ValueError(f"{where}: {value!r} is not one of {', '.join(allowed)}")
+        raise ValueError(f"{where}: {shown(value)} is not one of {', '.join(allowed)}")
 
 
 def read_description(path: Path) -> SceneDescription:
@@ -261,7 +261,7 @@ def _described(data: dict[str, Any], path: Path) -> SceneDescription:
         raise ValueError(f"{path.name}: no [[shape]] in the file")
     twice = [name for name, number in Counter(shape.name for shape in shapes).items() if number > 1]
     if twice:
-        raise ValueError(f"{path.name}: more than one shape is called {twice[0]!r}, give each a name of its own")
+        raise ValueError(f"{path.name}: more than one shape is called {shown(twice[0])}, give each a name of its own")
     where = f"{path.name}, viewpoints"
     viewpoints = _build(Viewpoints, _table(data.pop("viewpoints", {}), where), where)
     _check_viewpoints(viewpoints, where)
@@ -276,7 +276,7 @@ def _described(data: dict[str, Any], path: Path) -> SceneDescription:
 
 
 def _read_shape(values: dict[str, Any], file: str) -> Shape:
-    where = f"{file}, shape {values.get('name', '?')!r}"
+    where = f"{file}, shape {shown(values.get('name', '?'))}"
     material = _build(Material, _table(values.pop("material", {}), where + ", material"), where + ", material")
     _check_material(material, where + ", material")
     parts = tuple(_build(Part, part, where + ", part") for part in _tables(values, "part", where))
@@ -289,7 +289,7 @@ def _read_shape(values: dict[str, Any], file: str) -> Shape:
 
 def _table(value: Any, where: str) -> dict[str, Any]:
     if not isinstance(value, dict):
-        raise ValueError(f"{where}: {value!r} is no table of keys and values")
+        raise ValueError(f"{where}: {shown(value)} is no table of keys and values")
     return value
 
 
@@ -297,7 +297,7 @@ def _tables(data: dict[str, Any], key: str, where: str) -> list[dict[str, Any]]:
     """The tables [[key]] taken out of ``data``."""
     found = data.pop(key, [])
     if not isinstance(found, list):
-        raise ValueError(f"{where}: {key} = {found!r} is no list of tables, write [[{key}]] above each")
+        raise ValueError(f"{where}: {key} = {shown(found)} is no list of tables, write [[{key}]] above each")
     return [_table(one, f"{where}, {key}") for one in found]
 
 
