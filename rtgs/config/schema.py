@@ -10,7 +10,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
-from rtgs.core.refuse import refuse_unknown_words, words_of
+from rtgs.core.refuse import refuse_below, refuse_outside, refuse_unknown_words, refuse_unless, words_of
 from rtgs.evaluate.publish import OWN_DATA, DataKind
 from rtgs.evaluate.settings import EvaluationSettings
 from rtgs.mesh.settings import MeshSource, ObjectSettings, TsdfSettings
@@ -99,6 +99,7 @@ class MeshConfig:
 
     def __post_init__(self) -> None:
         refuse_unknown_words(self, "mesh")
+        refuse_outside(self, "mesh", 0, 1, "depth_ratio")
 
 
 @dataclass(frozen=True)
@@ -154,6 +155,14 @@ class RunConfig:
     """Folder under ``<root>/runs``. None: scene, method, preset, ablation and seed."""
     threads: int | None = None
     """Threads of torch and the native core. None: torch's default."""
+
+    def __post_init__(self) -> None:
+        refuse_below("seed", self.seed, 0)
+        refuse_below("threads", self.threads, 1)
+        refuse_unless(self.threads is None or self.threads <= _MOST_THREADS, "threads", self.threads, "at most 1024")
+
+
+_MOST_THREADS = 1024  # no machine has more cores
 
 
 def open_schema(cls: type) -> type:

@@ -41,6 +41,38 @@ def refuse_unless(legal: bool, key: str, value: object, allowed: str) -> None:
         raise RtgsError(f"{key}={value} must be {allowed}")
 
 
+LARGEST_COUNT = 2**31 - 1
+"""Of whole numbers in settings: what every kernel and file counts with."""
+
+
+def refuse_bad_counts(settings: object, where: str, **least: int) -> None:
+    """Every whole number of a settings object must be at least ``least[its name]``, or 0, and at most 2^31 - 1.
+
+    Raises:
+        RtgsError: names the first field that is not; ``where`` is the key of the settings object.
+    """
+    for entry in fields(settings):  # type: ignore[arg-type]
+        value = getattr(settings, entry.name)
+        if type(value) is int:
+            low = least.get(entry.name, 0)
+            allowed = f"at least {low}" if value < low else f"at most {LARGEST_COUNT}"
+            refuse_unless(low <= value <= LARGEST_COUNT, f"{where}.{entry.name}", value, allowed)
+
+
+def refuse_outside(settings: object, where: str, low: float, high: float, *names: str, open_low: bool = False) -> None:
+    """The named numbers of a settings object must lie in ``low`` to ``high``; ``open_low``: above ``low``.
+
+    Raises:
+        RtgsError: names the first that does not.
+    """
+    above = f"above {low:g}" if open_low else f"at least {low:g}"
+    allowed = above if math.isinf(high) else f"{above} and at most {high:g}"
+    for name in names:
+        value = getattr(settings, name)
+        legal = math.isfinite(value) and (low < value if open_low else low <= value) and value <= high
+        refuse_unless(legal, f"{where}.{name}", value, allowed)
+
+
 def shown(value: object, longest: int = 80) -> str:
     """A value for a message, cut where it is long; nothing a file holds makes a message of megabytes."""
     if isinstance(value, dict | list | tuple):

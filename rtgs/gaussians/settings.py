@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from rtgs.core.recipe import UNLESS_DEFAULT
-from rtgs.core.refuse import refuse_bad_numbers, refuse_unknown_words, refuse_unless
+from rtgs.core.refuse import refuse_bad_counts, refuse_bad_numbers, refuse_outside, refuse_unknown_words, refuse_unless
 
 DensityStrategy = Literal["adaptive", "mcmc"]
 Orientation = Literal["published", "pca"]
@@ -31,6 +31,10 @@ class InitSettings:
 
     def __post_init__(self) -> None:
         refuse_unknown_words(self, "init")
+        refuse_bad_counts(self, "init")
+        refuse_outside(self, "init", 0, 1, "opacity", open_low=True)
+        refuse_outside(self, "init", 0, math.inf, "scale", open_low=True)
+        refuse_outside(self, "init", 0, 3, "sh_degree")
 
 
 @dataclass(frozen=True)
@@ -61,6 +65,10 @@ class OptimizerSettings:
 
     def __post_init__(self) -> None:
         refuse_bad_numbers(self, "method.optimizer")
+        for name in ("beta1", "beta2"):
+            value = getattr(self, name)
+            refuse_unless(value < 1, f"method.optimizer.{name}", value, "below 1")
+        refuse_outside(self, "method.optimizer", 0, math.inf, "largest_scale", open_low=True)
         for name in ("decay_from", "decay_to"):
             value = getattr(self, name)
             refuse_unless(0 <= value <= 1, f"method.optimizer.{name}", value, "between 0 and 1")
@@ -100,6 +108,8 @@ class McmcSettings:
 
     def __post_init__(self) -> None:
         refuse_bad_numbers(self, "method.density.mcmc")
+        refuse_outside(self, "method.density.mcmc", 0, 1, "init_opacity", "min_opacity")
+        refuse_outside(self, "method.density.mcmc", 0, math.inf, "init_scale", open_low=True)
 
 
 @dataclass(frozen=True)
@@ -132,6 +142,15 @@ class DensitySettings:
 
     def __post_init__(self) -> None:
         refuse_unknown_words(self, "method.density")
+        refuse_bad_counts(self, "method.density", max_surfels=1, split_count=1, too_large_split_count=1)
+        signal = self.gradient_threshold
+        refuse_unless(signal >= 0, "method.density.gradient_threshold", signal, "at least 0")  # infinite: never
+        refuse_outside(self, "method.density", 0, math.inf, "size_border", "too_large")
+        refuse_outside(self, "method.density", 0, math.inf, "split_shrink", "too_large_shrink", open_low=True)
+        refuse_outside(self, "method.density", 0, 1, "min_opacity", "low_weight_share", "cap_share")
+        refuse_outside(self, "method.density", 0, 1, "reset_opacity", open_low=True)
+        if self.cap_turnover is not None:
+            refuse_outside(self, "method.density", 0, math.inf, "cap_turnover")
         if self.max_per_pixel is not None:
             refuse_unless(self.max_per_pixel > 0, "density.max_per_pixel", self.max_per_pixel, "above 0, or null")
 

@@ -5,12 +5,13 @@ Boundaries are shares of the run (``schedule.total``), intervals are steps.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from rtgs.core.errors import RtgsError
 from rtgs.core.recipe import UNLESS_DEFAULT
-from rtgs.core.refuse import refuse_bad_numbers, refuse_unknown_words, refuse_unless
+from rtgs.core.refuse import refuse_bad_counts, refuse_bad_numbers, refuse_outside, refuse_unknown_words, refuse_unless
 from rtgs.gaussians.settings import DensitySettings, InitSettings, MaterialSettings, OptimizerSettings
 from rtgs.optics.settings import OpticsSettings, WallSettings
 from rtgs.render.settings import RenderSettings
@@ -124,6 +125,7 @@ class ReflectionSettings:
 
     def __post_init__(self) -> None:
         refuse_bad_numbers(self, "method.reflection")
+        refuse_outside(self, "method.reflection", 0, 1, "smallest_alpha", "transmittance_cutoff", "alpha_cutoff")
         refuse_unknown_words(self, "method.reflection")
         for name in ("start", "densify_until"):
             value = getattr(self, name)
@@ -172,6 +174,9 @@ class InterfaceSettings:
             self.opacity >= self.floor, "method.transmittance.interface.opacity", self.opacity, f"at least {self.floor}"
         )
         refuse_unless(self.scale > 0, "method.transmittance.interface.scale", self.scale, "above 0")
+
+
+_EVERY = ("densify_every", "sh_every", "cells", "per_cell", "rebuild_every")
 
 
 def _transmittance_init() -> InitSettings:
@@ -244,6 +249,11 @@ class TransmittanceSettings:
     def __post_init__(self) -> None:
         refuse_bad_numbers(self, "method.transmittance")
         refuse_unknown_words(self, "method.transmittance")
+        refuse_bad_counts(self, "method.transmittance", **dict.fromkeys(_EVERY, 1))
+        refuse_outside(self, "method.transmittance", 0, 3, "sh_degree")
+        if self.max_gain is not None:
+            refuse_outside(self, "method.transmittance", 0, math.inf, "max_gain")
+        refuse_outside(self, "method.transmittance", 0, 1, "opaque_share", "opaque", "alpha_cutoff")
         key = "method.transmittance.start_opacity"
         refuse_unless(0 < self.start_opacity <= 1, key, self.start_opacity, "above 0 and at most 1")
         for name in ("start", "densify_until"):

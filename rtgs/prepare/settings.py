@@ -5,11 +5,12 @@ Numbers without a source are COLMAP's defaults (``pycolmap.IncrementalPipelineOp
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from rtgs.core.errors import RtgsError
-from rtgs.core.refuse import refuse_below, refuse_unknown_words, refuse_unless
+from rtgs.core.refuse import refuse_bad_counts, refuse_below, refuse_outside, refuse_unknown_words, refuse_unless
 from rtgs.prepare.normals.adapters import ADAPTERS, NormalAdapter, NormalNetwork
 
 Use = Literal["auto", "always", "never"]
@@ -39,6 +40,12 @@ class VideoSettings:
     jpeg_quality: int = 95
     """Of the written frames."""
 
+    def __post_init__(self) -> None:
+        refuse_bad_counts(self, "sfm.video", min_frames=1, max_side=32, jpeg_quality=1)
+        refuse_outside(self, "sfm.video", 1, 100, "jpeg_quality")
+        refuse_outside(self, "sfm.video", 0, math.inf, "candidates_per_second", open_low=True)
+        refuse_outside(self, "sfm.video", 0, math.inf, "min_motion")
+
 
 @dataclass(frozen=True)
 class FeatureSettings:
@@ -56,6 +63,7 @@ class FeatureSettings:
 
     def __post_init__(self) -> None:
         refuse_unknown_words(self, "sfm.features")
+        refuse_outside(self, "sfm.features", 0, 1, "peak_threshold")
 
 
 @dataclass(frozen=True)
@@ -82,6 +90,8 @@ class MatchingSettings:
 
     def __post_init__(self) -> None:
         refuse_unknown_words(self, "sfm.matching")
+        refuse_bad_counts(self, "sfm.matching")
+        refuse_outside(self, "sfm.matching", 0, math.inf, "ransac_error", open_low=True)
 
 
 @dataclass(frozen=True)
@@ -120,6 +130,10 @@ class MappingSettings:
 
     def __post_init__(self) -> None:
         refuse_unknown_words(self, "sfm.mapping")
+        refuse_bad_counts(self, "sfm.mapping")
+        refuse_outside(self, "sfm.mapping", 0, math.inf, "focal_factor", "good_error", open_low=True)
+        refuse_outside(self, "sfm.mapping", 0, 180, "init_min_angle")
+        refuse_outside(self, "sfm.mapping", 0, 1, "enough", "pose_min_ratio")
 
 
 @dataclass(frozen=True)
@@ -165,6 +179,9 @@ class SfmSettings:
 
     def __post_init__(self) -> None:
         refuse_unknown_words(self, "sfm")
+        refuse_bad_counts(self, "sfm")
+        refuse_outside(self, "sfm", 1, 100, "jpeg_quality")
+        refuse_outside(self, "sfm", 0, 1, "min_registered", "good_registered")
         for key, value, least in (
             ("features.max_side", self.features.max_side, 64),
             ("features.max_features", self.features.max_features, 100),

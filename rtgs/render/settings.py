@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
-from rtgs.core.refuse import refuse_bad_numbers
+from rtgs.core.refuse import refuse_bad_numbers, refuse_outside, refuse_unless
 
 
 @dataclass(frozen=True)
@@ -21,3 +22,8 @@ class RenderSettings:
 
     def __post_init__(self) -> None:
         refuse_bad_numbers(self, "method.render")
+        refuse_outside(self, "method.render", 0, math.inf, "near", open_low=True)
+        refuse_outside(self, "method.render", self.near, math.inf, "far", open_low=True)
+        refuse_outside(self, "method.render", 0, 1, "depth_ratio")
+        colour = len(self.background) == 3 and all(0 <= part <= 1 for part in self.background)
+        refuse_unless(colour, "method.render.background", self.background, "three numbers between 0 and 1")

@@ -269,9 +269,9 @@ def test_bad_observations_say_what_is_wrong():
         control.observe(torch.tensor([[0.0, 0], [0, 0], [0, float("nan")]]), torch.zeros(3))
     with pytest.raises(ValueError, match="scene extent 0"):
         DensityControl(DensitySettings(), 0)
-    with pytest.raises(ValueError, match=r"density.cap_turnover -0.1 must be at least 0"):
+    with pytest.raises(ValueError, match=r"density.cap_turnover=-0.1 must be at least 0"):
         DensityControl(DensitySettings(cap_turnover=-0.1), 1.0)
-    with pytest.raises(ValueError, match=r"density.min_opacity 1.5"):
+    with pytest.raises(ValueError, match=r"density.min_opacity=1.5"):
         DensityControl(DensitySettings(min_opacity=1.5), 1.0)
 
 

@@ -128,6 +128,8 @@ class DrawnSettings:
         refuse_below("masks.drawn.grabcut_rounds", self.grabcut_rounds, 1)
         refuse_below("masks.drawn.grabcut_side", self.grabcut_side, 64)
         refuse_below("masks.drawn.min_angle", self.min_angle, 0.0)
+        _refuse_no_share("masks.drawn.click_radius", self.click_radius)
+        _refuse_no_share("masks.drawn.max_error", self.max_error)
         refuse_below("masks.drawn.frame", self.frame, 0.05)
 
 
