@@ -78,7 +78,17 @@ def _message(error: Exception) -> str:
         return f"{error}; free some space, then the same command goes on where it was"
     if isinstance(inner, OSError) and inner.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         return f"{error}; make it writable, or choose another folder for store and runs with RTGS_ROOT or paths.root"
+    if _memory_is_full(inner):
+        return (
+            f"{error}; there is not enough memory: smaller views (scene.long_side=800), fewer Gaussians "
+            "(density.max_surfels=...), or fewer runs at a time; the same command goes on from the last checkpoint"
+        )
     return str(error)
+
+
+def _memory_is_full(error: BaseException) -> bool:
+    """Python's own, and what torch says of its allocator."""
+    return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and "DefaultCPUAllocator" in str(error))
 
 
 def _disk_is_full(error: BaseException) -> bool:
@@ -89,6 +99,8 @@ def is_for_users(error: BaseException) -> bool:
     """Whether the message of an error is meant for users: our own types, values our code refused, the disk."""
     inner = getattr(error, "error", error)  # what a step raised
     if isinstance(inner, (RtgsError, OSError)) or _package(inner) in ("rtgs", "hydra", "omegaconf", "yaml"):
+        return True
+    if _memory_is_full(inner):
         return True
     if _disk_is_full(inner):  # safetensors has an exception of its own for it
         return True

@@ -37,6 +37,8 @@ def show(words: list[str]) -> int:
     from rtgs.gaussians.ply import read_gaussians
 
     gaussians = read_gaussians(options.file, skip_broken=options.skip_broken)
+    if not len(gaussians):
+        raise RtgsError(f"{options.file} holds 0 Gaussians: there is nothing to show; was another file meant?")
     kind = type(gaussians).__name__.lower()
     print(f"{options.file}: {len(gaussians):,} {kind}, SH degree {gaussians.sh_degree}")
     out = options.out or Path(f"{options.file.name.removesuffix('.ply')}-shown")

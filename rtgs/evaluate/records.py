@@ -7,9 +7,11 @@ import json
 import math
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
+from typing import Any
 
 from rtgs.core import records
 from rtgs.core.errors import RtgsError
+from rtgs.core.listing import spreadsheet_cell
 
 FORMAT = "rtgs-evaluation"
 VERSION = 5  # 2: layers; 3: transmission, given masks; 4: surface in the mask, object's mesh; 5: what is framed
@@ -153,7 +155,7 @@ class EvaluationTable:
     def _present(self, metric: str) -> list[float]:
         if metric not in (*METRICS, *GLASS_METRICS):
             raise KeyError(f"no metric {metric!r}; there are {', '.join((*METRICS, *GLASS_METRICS))}")
-        values = (row.values.get(metric) if metric in GLASS_METRICS else row.values[metric] for row in self.rows)
+        values = (row.values.get(metric) for row in self.rows)
         return [value for value in values if value is not None]
 
 
@@ -204,7 +206,11 @@ def write_csv(path: Path, table: EvaluationTable) -> None:
         writer.writeheader()
         for row in table.rows:
             cells = {"view": row.view, "resolution": f"{row.width}x{row.height}", "mask_share": row.mask_share}
-            writer.writerow({**facts, **row.values, **cells})
+            writer.writerow(_cells({**facts, **row.values, **cells}))
         for label, statistic in (("mean", table.mean), ("std", table.std)):
             cells = {name: statistic(name) for name in table.metrics}
-            writer.writerow({**facts, **cells, "view": label, "resolution": table.resolution})
+            writer.writerow(_cells({**facts, **cells, "view": label, "resolution": table.resolution}))
+
+
+def _cells(row: dict[str, Any]) -> dict[str, object]:
+    return {key: spreadsheet_cell(value) for key, value in row.items()}

@@ -12,6 +12,7 @@ import io
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
+from rtgs.core.listing import spreadsheet_cell
 from rtgs.evaluate.publish import (
     ALL,
     COSTS,
@@ -204,7 +205,7 @@ def comma_separated(table: PaperTable) -> str:
     for scene in table.scenes:
         for method in table.methods:
             if cell := table.cell(method, scene):
-                writer.writerow(_csv_row(table.spec, cell, ALL))
+                writer.writerow(map(spreadsheet_cell, _csv_row(table.spec, cell, ALL)))
     return stream.getvalue()
 
 
@@ -235,9 +236,14 @@ def latex(table: PaperTable) -> str:
     return "\n".join([*lines, r"\end{table*}"]) + "\n"
 
 
+_TEX = str.maketrans({
+    "\\": r"\textbackslash{}", "{": r"\{", "}": r"\}", "$": r"\$", "^": r"\textasciicircum{}",
+    "~": r"\textasciitilde{}", "_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "`": "'", "\n": " ", "\r": " ",
+})  # fmt: skip
+
+
 def _tex(text: str) -> str:
-    for mark, code in (("\\", r"\textbackslash "), ("_", r"\_"), ("%", r"\%"), ("&", r"\&"), ("#", r"\#"), ("`", "'")):
-        text = text.replace(mark, code)
+    text = text.translate(_TEX)
     return text.replace("↑", r"$\uparrow$").replace("↓", r"$\downarrow$").replace("±", r"$\pm$")
 
 

@@ -172,3 +172,15 @@ def test_the_same_run_twice_and_no_run_are_refused():
         build_table(STAND_IN, [])
     with pytest.raises(ValueError, match=r"table\.data='mine'"):
         TableSpec("t", "T", "mine")
+
+
+def test_cells_are_escaped_for_latex_and_for_spreadsheets():
+    spec = TableSpec("t", "A $10^3 ~ {x}_1 & #2 \\write18{rm} 100 %", "own")
+    table = build_table(spec, [run("=cmd|'/c calc'!A1", "@sum{a}", 25.0)])
+    text = latex(table)
+    assert r"A \$10\textasciicircum{}3 \textasciitilde{} \{x\}\_1 \& \#2 \textbackslash{}write18\{rm\} 100 \%" in text
+    assert r"@sum\{a\}" in text
+    row = next(csv.DictReader(io.StringIO(comma_separated(table))))
+    assert row["method"] == "'=cmd|'/c calc'!A1"
+    assert row["scene"] == "'@sum{a}"
+    assert float(row["psnr"]) == 25.0

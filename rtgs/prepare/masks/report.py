@@ -11,7 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from rtgs.core.records import read_record
+from rtgs.core.listing import spreadsheet_cell
+from rtgs.core.records import damaged, read_record
+from rtgs.core.refuse import shown
 from rtgs.prepare.masks.detect import Box
 from rtgs.scenes.capture import list_some
 
@@ -99,7 +101,8 @@ class MaskReport:
                 agreement = "" if row.agreement is None else f"{row.agreement:.3f}"
                 boxes = "; ".join(f"{box.phrase} {box.score:.2f}" for box in row.boxes)
                 shares = (f"{row.area:.4f}", agreement, f"{row.missing:.3f}", f"{row.extra:.3f}")
-                table.writerow((row.name, row.origin, *shares, "yes" if row.flagged else "", row.action, boxes))
+                cells = (row.name, row.origin, *shares, "yes" if row.flagged else "", row.action, boxes)
+                table.writerow(map(spreadsheet_cell, cells))
 
     @staticmethod
     def read(folder: Path) -> MaskReport:
@@ -108,7 +111,10 @@ class MaskReport:
         Raises:
             RtgsError: it is missing or damaged.
         """
-        return read_record(MaskReport, folder / REPORT_FILE)
+        report = read_record(MaskReport, folder / REPORT_FILE)
+        if report.method not in METHODS:
+            raise damaged(folder / REPORT_FILE, f"method is {shown(report.method)}")
+        return report
 
 
 @dataclass(frozen=True)

@@ -272,9 +272,11 @@ def test_a_broken_file_of_ones_own_is_named(words, tmp_path, capsys):
             "free some space",
         ),
         (OSError(errno.EROFS, "Read-only file system", "outputs"), "RTGS_ROOT"),
+        (MemoryError(), "not enough memory: smaller views (scene.long_side=800)"),
+        (RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried"), "not enough memory"),
     ],
 )
-def test_what_the_disk_refuses_is_told_with_advice(error, advice, capsys):
+def test_what_disk_and_memory_refuse_is_told_with_advice(error, advice, capsys):
     assert report_error(StepFailed(import_scene.STEP.step(ImportParams(SceneSettings(), "0" * 64, "")), error)) == 1
     errors = capsys.readouterr().err
     assert advice in errors
