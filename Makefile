@@ -6,6 +6,8 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 NATIVE := $(shell find rtgs/native -name "*.cpp" -o -name "*.h" -o -name "*.cmake") CMakeLists.txt pyproject.toml
 RUN ?=
+MINUTES ?= 30
+FIRST ?= 0
 # of the tables: PRESET smoke quick standard paper; SEEDS how many; DATA stand_in ref_real nu_nerf (with DATA_ROOT); WORKERS
 PRESET ?= quick
 SEEDS ?= 1
@@ -30,7 +32,7 @@ WORKER_WORDS = $(if $(findstring hydra/launcher=,$(RUN)),,hydra.launcher.workers
 TABLE = $(BIN)/rtgs run preset=$(PRESET) $(SEED_LIST) $(WORKER_WORDS) $(DATA_WORDS)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test e2e bench lint format docs dashboard accept-steps contact-sheet clean
+.PHONY: help setup demo test fuzz e2e bench lint format docs dashboard accept-steps contact-sheet clean
 .PHONY: reproduce-table1 reproduce-table2 reproduce-table3 reproduce-fig-split-sum
 
 help: ## list the targets
@@ -72,6 +74,9 @@ reproduce-fig-split-sum: setup ## microfacet weight against split-sum shading
 
 test: setup ## the tests
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
+
+fuzz: setup ## damaged files against every reader for MINUTES, ends with counts (FIRST= number of the first input)
+	$(BIN)/python -m tests.fuzz.attack --minutes $(MINUTES) --first $(FIRST)
 
 e2e: setup ## long end-to-end runs
 	$(BIN)/python -m pytest -m slow
