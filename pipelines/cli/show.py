@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -196,7 +197,12 @@ def _read_transform(path: Path | None) -> tuple[Tensor, float] | None:
         raise RtgsError(f"{path} is no dataparser_transforms.json (keys transform and scale): {error}") from error
     rotation = matrix[:3, :3] if matrix.ndim == 2 and matrix.shape[0] >= 3 and matrix.shape[1] == 4 else None
     eye = torch.eye(3, dtype=torch.float64)
-    if rotation is None or scale <= 0 or not torch.allclose(rotation @ rotation.T, eye, atol=1e-4):
+    if (
+        rotation is None
+        or not 0 < scale < math.inf
+        or not bool(torch.isfinite(matrix).all())
+        or not torch.allclose(rotation @ rotation.T, eye, atol=1e-4)
+    ):
         raise RtgsError(f"{path}: transform must be 3x4 with a rotation, and scale positive")
     return matrix[:3], scale
 

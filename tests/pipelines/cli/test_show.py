@@ -94,6 +94,11 @@ def test_a_model_in_nerfstudios_frame_is_seen_alike(tmp_path, splat, demo):
     (tmp_path / "other.json").write_text('{"transform": [[1, 0, 0, 0], [0, 2, 0, 0], [0, 0, 1, 0]], "scale": 1}')
     with pytest.raises(ValueError, match="transform must be 3x4 with a rotation"):
         _read_transform(tmp_path / "other.json")
+    for scale in ("NaN", "1e999", "0"):
+        eye = "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]"
+        (tmp_path / "other.json").write_text(f'{{"transform": {eye}, "scale": {scale}}}')
+        with pytest.raises(ValueError, match="scale positive"):
+            _read_transform(tmp_path / "other.json")
 
 
 @pytest.mark.parametrize(
