@@ -174,6 +174,27 @@ class InterfaceSettings:
         refuse_unless(self.scale > 0, "method.transmittance.interface.scale", self.scale, "above 0")
 
 
+@dataclass(frozen=True)
+class VertexSettings:
+    """Vertices of the transparent object's mesh, learned from the photos in the third stage (docs/glass_light.md)."""
+
+    rate: float = (
+        0.0  # of Adam: voxels a step at the start, a tenth of it at the end; 0: the mesh stays as it was found
+    )
+    start: float = 0.1  # share of the stage; before it they stand still
+    spacing: float = 8.0  # voxels between the points at which heights are learned
+    rebuilds: int = 4  # times that the mesh is made anew, the last at the end of the stage
+    hold: float = 1e-4  # weight of the mean square of the heights, voxels
+    outline: float = 1e-2  # weight of the mean square distance from the masks' outlines, pixels
+
+    def __post_init__(self) -> None:
+        refuse_bad_numbers(self, "method.transmittance.vertices")
+        key = "method.transmittance.vertices"
+        refuse_unless(0 <= self.start < 1, f"{key}.start", self.start, "at least 0 and below 1")
+        refuse_unless(self.spacing >= 1, f"{key}.spacing", self.spacing, "at least 1")
+        refuse_unless(self.rebuilds >= 1, f"{key}.rebuilds", self.rebuilds, "at least 1: the mesh of the end")
+
+
 def _transmittance_init() -> InitSettings:
     return InitSettings(scale=0.5)  # a quarter of the hits of each ray at the start
 
@@ -238,6 +259,9 @@ class TransmittanceSettings:
     alpha_cutoff: float = 1 / 255
     interface: InterfaceSettings = field(default_factory=InterfaceSettings)
     wall: WallSettings = field(default_factory=WallSettings, metadata={"recipe": "unless", "value": WallSettings()})
+    vertices: VertexSettings = field(
+        default_factory=VertexSettings, metadata={"recipe": "unless", "value": VertexSettings()}
+    )
     init: InitSettings = field(default_factory=_transmittance_init)
     density: DensitySettings = field(default_factory=_reflection_density)
 
@@ -279,4 +303,10 @@ class MethodSettings:
             raise RtgsError(
                 "method.transmittance.wall.light=fresnel gives shares of linear light, but "
                 f"method.optics.blend={self.optics.blend}: set it to linear, or wall.light=learned"
+            )
+        if self.transmittance.vertices.rate > 0 and self.transmittance.normal != "mesh":
+            raise RtgsError(
+                f"method.transmittance.vertices.rate={self.transmittance.vertices.rate:g} moves the object's mesh, but "
+                f"method.transmittance.normal={self.transmittance.normal} shows none of it: set it to mesh, or the "
+                "rate to 0"
             )

@@ -51,9 +51,20 @@ class WallLight:
         group: the index of refraction, where it is learned; None: it stays.
     """
 
-    def __init__(self, settings: WallSettings, guide: ObjectGuide, glass: Tensor, views: Sequence[View]) -> None:
+    def __init__(
+        self,
+        settings: WallSettings,
+        guide: ObjectGuide,
+        glass: Tensor,
+        views: Sequence[View],
+        *,
+        moving: bool = False,
+    ) -> None:
+        """``moving``: the vertices of the mesh are learned."""
         self.settings = settings
+        self._mesh = guide.mesh  # as it was found
         self._guide = guide
+        self._moving = moving
         self._glass = glass
         self._views = views
         self._openings: Openings | None = None
@@ -81,7 +92,7 @@ class WallLight:
 
     @cached_property
     def _parts(self) -> list[Tensor]:
-        return upward_parts(self._guide.mesh, self._views)
+        return upward_parts(self._mesh, self._views)
 
     @cached_property
     def _upward(self) -> Tensor:
@@ -101,9 +112,9 @@ class WallLight:
             self._tried = opened
             return look(view)
 
-        mesh, least = self._guide.mesh, self.settings.opening_gain
+        least = self.settings.opening_gain
         try:
-            found = judged_openings(mesh, self._parts, self._views, shown, least)
+            found = judged_openings(self._mesh, self._parts, self._views, shown, least)
         finally:
             self._tried = None
         self._adopt(found)
@@ -133,8 +144,17 @@ class WallLight:
         if self._follow:
             key = faces.numpy().tobytes()
             before = self._guides.pop(key, None)
-            self._inner = before or InnerGuide(self._guide.mesh, self._glass, self.settings.bounces, faces)
+            mesh, bounces = self._guide.mesh, self.settings.bounces
+            self._inner = before or InnerGuide(mesh, self._glass, bounces, faces, moving=self._moving)
             self._guides = {**dict([*self._guides.items()][-1:]), key: self._inner}  # the last two
+
+    def follow(self, guide: ObjectGuide) -> None:
+        """The vertices of the mesh have moved; its faces are the same."""
+        self._guide, opened = guide, self._opened
+        assert opened is not None
+        self._guides.clear()
+        self._opened = None
+        self._open(opened)
 
     def walls(self, camera: Camera, pixels: Tensor) -> Tensor | float:
         """(P,) float32 of flattened pixels (P,): 1, or 0 where the object's first surface is an opening; 1: nothing is
