@@ -20,6 +20,7 @@ class Meetings:
     vertices: Tensor  # (L, 3) int32: corners of the triangle
     shares: Tensor  # (L, 3) float32 that they have in the point; negative where ``normal`` looks inward; 0: it stays
     normal: Tensor  # (L, 3) float32 unit: smoothed, against the ray
+    turn: Tensor  # (L, 3, 3) float32: by how much the normal turns along the triangle, for each world unit
 
     @property
     def bytes(self) -> int:
@@ -69,7 +70,18 @@ def meetings(
     there = triangle >= 0
     face = np.where(there, triangle, 0)
     inward = (interpolated(mesh, corners, face, points) * normal).sum(1) < 0
-    shares = corner_shares(mesh, face, points) * (there * np.where(inward, -1.0, 1.0))[:, None]
+    sign = there * np.where(inward, -1.0, 1.0)
+    shares = corner_shares(mesh, face, points) * sign[:, None]
+    turn = (corners[face].astype(np.float64).transpose(0, 2, 1) @ _share_gradients(mesh, face)) * sign[:, None, None]
     numbers = torch.from_numpy(np.ascontiguousarray(mesh.faces[face], np.int32))
-    both = (torch.from_numpy(np.ascontiguousarray(each, np.float32)) for each in (shares, normal))
-    return Meetings(numbers, *both)
+    values = (torch.from_numpy(np.ascontiguousarray(each, np.float32)) for each in (shares, normal, turn))
+    return Meetings(numbers, *values)
+
+
+def _share_gradients(mesh: TriangleMesh, triangle: np.ndarray) -> np.ndarray:
+    """(N, 3, 3) float64: of the share of each corner, by place."""
+    corners = mesh.vertices[mesh.faces[triangle]].astype(np.float64)
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    square = np.maximum((normal * normal).sum(1), 1e-300)
+    opposite = np.stack([corners[:, (k + 2) % 3] - corners[:, (k + 1) % 3] for k in range(3)], axis=1)
+    return np.cross(normal[:, None], opposite) / square[:, None, None]

@@ -80,6 +80,7 @@ def test_gradients_pass_a_sparse_map_and_the_corners_of_triangles(ball: Displace
         torch.tensor([[0, 1, 2], [1, 2, 3]], dtype=torch.int32),
         torch.tensor([[0.2, 0.3, 0.5], [-0.1, -0.6, -0.3]]),
         torch.zeros(2, 3),
+        torch.zeros(2, 3, 3),
     )
     field = torch.randn(5, 4, generator=generator, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(met.at, (field,))
@@ -93,3 +94,6 @@ def test_a_meeting_knows_on_which_side_of_the_mesh_it_is(ball: Displacement):
     met = meetings(mesh.mesh, mesh.corners, face, points, outward * [[1.0], [-1.0], [1.0]])
     heights = torch.full((len(mesh.mesh.vertices), 1), 0.25)
     torch.testing.assert_close(met.at(heights)[:, 0], torch.tensor([0.25, -0.25, 0.0]))
+    along = torch.from_numpy(np.cross(outward[:1], [[0.0, 0.0, 1.0]])).float().repeat(3, 1)
+    turns = (met.turn @ along[..., None])[..., 0]  # on a sphere by an angle of one over its radius for each unit
+    torch.testing.assert_close(turns, along / RADIUS * torch.tensor([[1.0], [-1.0], [0.0]]), atol=0.05, rtol=0)

@@ -104,6 +104,11 @@ class LearnedVertices:
         self._met: dict[tuple[object, ...], tuple[Tensor, Meetings]] = {}
         self.__dict__.pop("_outline", None)
 
+    @property
+    def found(self) -> ObjectMesh:
+        """The mesh before anything was learned."""
+        return self._field.base
+
     # ---- what rays meet
 
     def bend(self, step: int) -> Bend | None:
