@@ -72,7 +72,7 @@ def _score(mesh: ObjectMesh, scene: Scene) -> NormalScore:
     seen = [view for view in scene.test if view.mask is not None]
     views = [view.camera for view in seen]
     glass = [view.mask for view in seen if view.mask is not None]
-    return normal_score(mesh, truth, views, glass, opaque_depths(scene.name, views))
+    return normal_score(mesh, truth, views, glass, opaque_depths(scene.name.split(" ")[0], views))
 
 
 def main() -> None:

@@ -44,7 +44,7 @@ class Leg:
         """The stretches ``chosen`` (int64), with other parents."""
         values = (self.origin, self.direction, self.length, self.cosine, self.wall)
         met = None if self.met is None else self.met.rows(chosen)
-        return Leg(parent, *(each[chosen] for each in values), met)
+        return Leg(parent, *(each[chosen] for each in values), met=met)
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,9 @@ class InnerGuide:
         cosine[wall & ~goes_on] = 0.0  # a label or a lid lets nothing through
         stays = ~there | (wall & ~goes_on)
         met = self._met(np.where(stays, -1, triangle), ends, inward)
-        leg = Leg(torch.from_numpy(parent), *(_float(each) for each in (points, mirrored, length, cosine, wall)), met)
+        leg = Leg(
+            torch.from_numpy(parent), *(_float(each) for each in (points, mirrored, length, cosine, wall)), met=met
+        )
         return leg, ends, mirrored, inward, np.flatnonzero(goes_on)
 
     def _first(self, hits: RayHits) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
