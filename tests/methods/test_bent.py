@@ -85,6 +85,12 @@ def seen(mesh: ObjectMesh, eye: Camera) -> tuple[Meetings, Tensor, Tensor]:
     return meetings(mesh.mesh, mesh.corners, triangle, points, normal.numpy()), depth, view
 
 
+def mirror_at(normal: Tensor, depth: Tensor) -> SurfacePixels:
+    """Pixels with these normals (P, 3) and depths, and nothing else."""
+    none = torch.zeros(0)
+    return SurfacePixels(none, none, none, none, normal.T, depth)
+
+
 def outputs(paths: InnerPaths) -> list[Tensor]:
     legs = [getattr(leg, name) for leg in paths.legs for name in ("origin", "direction", "length", "cosine")]
     return [paths.cosine, *legs]
@@ -105,10 +111,13 @@ def test_gradients_of_normals_and_of_all_hit_points_are_right(ball: Displacement
     chosen = torch.arange(0, 200, 29)
     _, paths = paths_of(ball.base).take(paths_of(ball.base).pixels[chosen])
     paths = wide(paths)
+    assert paths.met is not None
     assert [len(leg.length) for leg in paths.legs] == [len(chosen)] * 2
     met, depth, view = seen(ball.base, camera())
     met, depth, view = met.rows(chosen), depth[chosen], view[chosen]
-    used = torch.unique(torch.cat([m.vertices.flatten() for m in (met, paths.met, *(leg.met for leg in paths.legs))]))
+    used = torch.unique(
+        torch.cat([m.vertices.flatten() for m in (met, paths.met, *(leg.met for leg in paths.legs)) if m])
+    )
     generator = torch.Generator().manual_seed(1)
     given = 1e-3 * torch.randn(len(used), 4, generator=generator, dtype=torch.float64)
 
@@ -116,7 +125,7 @@ def test_gradients_of_normals_and_of_all_hit_points_are_right(ball: Displacement
         field = torch.zeros(len(ball.normals), 4, dtype=torch.float64).index_copy(0, used.long(), rows)
         bend = Bend(field)
         near, normal = seen_wall(bend, met, depth, view)
-        pixels = SurfacePixels(*[torch.zeros(0)] * 4, normal.T, near)
+        pixels = mirror_at(normal, near)
         rays = mirror_rays_twin(pixels, torch.tensor([0.0, 0.0, -AWAY], dtype=torch.float64), view.T)
         inner = bent_paths(paths, bend)
         return (
@@ -192,7 +201,7 @@ def test_known_offsets_are_found_again_from_reflected_directions(ball: Displacem
         square, angles = [], []
         for met, depth, view, centre, true in cases:
             near, normal = seen_wall(bend, met, depth.float(), view.float())
-            pixels = SurfacePixels(*[torch.zeros(0)] * 4, normal.T, near)
+            pixels = mirror_at(normal, near)
             rays = mirror_rays_twin(pixels, centre.float(), view.float().T)
             wanted = mirror_rays_twin(replace(pixels, normal=true.float().T), centre.float(), view.float().T)
             square.append((rays.directions - wanted.directions).square().sum(1))

@@ -207,8 +207,8 @@ def test_a_group_of_settings_that_is_new_counts_as_its_default_too():
     assert "vertices" not in values["method"]["transmittance"] or values["method"]["transmittance"].pop("vertices")
     before = replace(record, settings=json.dumps(values, sort_keys=True), settings_digest="another")
     check_resumable(before, record, PLAIN, warn=pytest.fail)
-    moving = replace(PLAIN.method.transmittance, normal="mesh", vertices=VertexSettings(rate=0.03))
-    other = RunSettings(replace(PLAIN.method, transmittance=moving), PLAIN.schedule, PLAIN.seed)
+    moving = replace(MethodSettings().transmittance, normal="mesh", vertices=VertexSettings(rate=0.03))
+    other = RunSettings(MethodSettings(transmittance=moving), PLAIN.schedule, PLAIN.seed)
     with pytest.raises(CheckpointError, match=r"transmittance\.vertices\.rate: 0\.0 then, 0\.03 now"):
         check_resumable(before, make(settings=other).record, other, warn=pytest.fail)
 
