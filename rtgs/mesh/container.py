@@ -40,6 +40,7 @@ class ObjectMesh:
     voxel: float  # world units: of the grid it was found on; walls nearer than 2 voxels are one
     flat: bool  # a pane: one wall, no interior; what is transmitted lies behind it
     surface: str = ""  # how a hull was smoothed: "free", "sphere", ...; empty: it is as it was carved
+    turned: np.ndarray | None = None  # (F, 3, 3) float32 unit normals of the corners; None: those of the triangles
 
     def __post_init__(self) -> None:
         if len(self.mesh.faces) == 0:
@@ -57,6 +58,8 @@ class ObjectMesh:
     @cached_property
     def corners(self) -> np.ndarray:
         """(F, 3, 3) float32 smoothed unit normals of the faces' corners; of a given mesh only a little."""
+        if self.turned is not None:
+            return self.turned
         if self.surface == "planes":
             return corner_normals(self.mesh, 0, _PLANES_CREASE)
         corners = corner_normals(self.mesh, _NORMAL_ROUNDS)

@@ -7,7 +7,7 @@ stands, so the paths of a camera are found once.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from torch import Tensor
 from rtgs.core.cameras import Camera
 from rtgs.mesh.container import ObjectGuide, ObjectMesh, ObjectSurfaces, camera_key
 from rtgs.mesh.guide import RayHits
+from rtgs.mesh.meetings import Meetings, meetings
 from rtgs.mesh.normals import interpolated
 
 OFF_THE_WALL = 1e-4  # of the object's size: a mirrored ray starts so far inside
@@ -32,6 +33,7 @@ class Leg:
     length: Tensor  # (L,) float32 world units to the next wall; 0 where the mesh has none
     cosine: Tensor  # (L,) float32 of the angle of incidence there; 1 where there is no wall, 0 where it is no glass
     wall: Tensor  # (L,) float32: 1; 0 where nothing reflects: there is no wall, or an opening
+    met: Meetings | None = None  # with that wall, for walls that move; without a wall, and at a label, it stays
 
     @property
     def exit(self) -> Tensor:
@@ -41,7 +43,8 @@ class Leg:
     def rows(self, chosen: Tensor, parent: Tensor) -> Leg:
         """The stretches ``chosen`` (int64), with other parents."""
         values = (self.origin, self.direction, self.length, self.cosine, self.wall)
-        return Leg(parent, *(each[chosen] for each in values))
+        met = None if self.met is None else self.met.rows(chosen)
+        return Leg(parent, *(each[chosen] for each in values), met=met)
 
 
 @dataclass(frozen=True)
@@ -51,12 +54,14 @@ class InnerPaths:
     pixels: Tensor  # (K,) int64 into the flattened image, ascending: their ray meets a far wall
     cosine: Tensor  # (K,) float32 of the angle of incidence there
     legs: tuple[Leg, ...]  # the first has K rows; later ones those that the one before goes on to
+    met: Meetings | None = None  # with the far wall, for walls that move
 
     @property
     def bytes(self) -> int:
         """Of all tensors."""
-        tensors = (self.pixels, self.cosine, *(each for leg in self.legs for each in vars(leg).values()))
-        return sum(each.numel() * each.element_size() for each in tensors)
+        values = [getattr(each, field.name) for each in (self, *self.legs) for field in fields(each)]
+        own = sum(each.numel() * each.element_size() for each in values if isinstance(each, Tensor))
+        return own + sum(each.bytes for each in values if isinstance(each, Meetings))
 
     def take(self, wanted: Tensor) -> tuple[Tensor, InnerPaths]:
         """Of pixels ``wanted`` (R,) int64: (K',) rows of it that have a path, and these paths in that order."""
@@ -70,7 +75,8 @@ class InnerPaths:
             kept = chosen if not legs else (new[leg.parent] >= 0).nonzero()[:, 0]
             legs.append(leg.rows(kept, torch.arange(len(kept)) if not legs else new[leg.parent[kept]]))
             before, count = kept, len(leg.length)
-        return rows, InnerPaths(self.pixels[chosen], self.cosine[chosen], tuple(legs))
+        met = None if self.met is None else self.met.rows(chosen)
+        return rows, InnerPaths(self.pixels[chosen], self.cosine[chosen], tuple(legs), met)
 
 
 class InnerGuide:
@@ -78,12 +84,15 @@ class InnerGuide:
 
     ``bounces``: reflections inside the object that are followed, at least 1. ``glass`` (F,) bool: faces that are glass;
     light is mirrored at no others. ``opened`` (F,) bool: those that are no wall at all; None: there are none.
+    ``moving``: the paths say where they met the walls.
     """
 
-    def __init__(self, mesh: ObjectMesh, glass: Tensor, bounces: int, opened: Tensor | None = None) -> None:
+    def __init__(
+        self, mesh: ObjectMesh, glass: Tensor, bounces: int, opened: Tensor | None = None, *, moving: bool = False
+    ) -> None:
         if bounces < 1:
             raise ValueError(f"bounces is {bounces}: at least 1 reflection inside the object is followed")
-        self.mesh, self.bounces = mesh, bounces
+        self.mesh, self.bounces, self._moving = mesh, bounces, moving
         self._open = np.zeros(len(glass), bool) if opened is None else opened.numpy()
         self._glass = glass.numpy() & ~self._open
         size = float(np.linalg.norm(mesh.bounds[1] - mesh.bounds[0]))
@@ -115,13 +124,17 @@ class InnerGuide:
         points = origins[kept] + distance[kept, None] * directions[kept]
         unit = directions[kept] / np.linalg.norm(directions[kept], axis=1, keepdims=True)
         normal = self._inward(triangle[kept], points, unit)
+        met = self._met(triangle[kept], points, normal)
         legs: list[Leg] = []
         parent, cosine = np.arange(int(kept.sum())), -(normal * unit).sum(1)
         for _ in range(self.bounces):
             leg, points, unit, normal, going = self._mirror(parent, points, unit, normal)
             legs.append(leg)
             parent, points, unit, normal = going, points[going], unit[going], normal[going]
-        return InnerPaths(pixels[torch.from_numpy(kept)], _float(cosine), tuple(legs))
+        return InnerPaths(pixels[torch.from_numpy(kept)], _float(cosine), tuple(legs), met)
+
+    def _met(self, triangle: np.ndarray, points: np.ndarray, normal: np.ndarray) -> Meetings | None:
+        return meetings(self.mesh.mesh, self.mesh.corners, triangle, points, normal) if self._moving else None
 
     def _mirror(self, parent: np.ndarray, points: np.ndarray, unit: np.ndarray, normal: np.ndarray):
         """The leg from ``points``; with where it ends, its directions, normals there, and the rows that go on."""
@@ -137,7 +150,11 @@ class InnerGuide:
         wall = there.copy()
         wall[there] &= ~self._open[triangle[there]]
         cosine[wall & ~goes_on] = 0.0  # a label or a lid lets nothing through
-        leg = Leg(torch.from_numpy(parent), *(_float(each) for each in (points, mirrored, length, cosine, wall)))
+        stays = ~there | (wall & ~goes_on)
+        met = self._met(np.where(stays, -1, triangle), ends, inward)
+        leg = Leg(
+            torch.from_numpy(parent), *(_float(each) for each in (points, mirrored, length, cosine, wall)), met=met
+        )
         return leg, ends, mirrored, inward, np.flatnonzero(goes_on)
 
     def _first(self, hits: RayHits) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

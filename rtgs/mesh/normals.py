@@ -66,14 +66,18 @@ def neighbourhood_normals(
 
 def interpolated(mesh: TriangleMesh, corners: np.ndarray, triangle: np.ndarray, points: np.ndarray) -> np.ndarray:
     """(N, 3) float32 unit normals at ``points`` (N, 3) that lie on the faces ``triangle`` (N,)."""
+    shares, own = corner_shares(mesh, triangle, points), corners[triangle].astype(np.float64)
+    return _unit((shares[..., None] * own).sum(1), own[:, 0]).astype(np.float32)
+
+
+def corner_shares(mesh: TriangleMesh, triangle: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """(N, 3) float64 shares, none below 0, of the corners of faces ``triangle`` (N,) in ``points`` (N, 3) on them."""
     a, b, c = (mesh.vertices[mesh.faces[triangle, k]].astype(np.float64) for k in range(3))
     normal = np.cross(b - a, c - a)
     square = np.maximum((normal * normal).sum(1), 1e-300)
     u = (np.cross(c - b, points - b) * normal).sum(1) / square  # share of corner a
     v = (np.cross(a - c, points - c) * normal).sum(1) / square
-    shares = np.clip(np.stack([u, v, 1 - u - v], axis=1), 0, None)
-    own = corners[triangle].astype(np.float64)
-    return _unit((shares[..., None] * own).sum(1), own[:, 0]).astype(np.float32)
+    return np.clip(np.stack([u, v, 1 - u - v], axis=1), 0, None)
 
 
 def _around_corners(faces: np.ndarray, vertices: int) -> tuple[np.ndarray, np.ndarray]:

@@ -191,8 +191,9 @@ def specular_terms(setup: Setup, mask: Callable[[View], Tensor | None] = masked_
 
 
 def glass_terms(setup: Setup, glass: Glass) -> Terms:
-    """L_d, and what holds the interface's normals (method.md 5.1)."""
+    """L_d, what holds the interface's normals (method.md 5.1), and what holds vertices that are learned."""
     loss, interface = setup.settings.loss, setup.settings.transmittance.interface
+    vertices = setup.settings.transmittance.vertices
 
     def depth(rendered: RenderedView, view: View) -> Tensor | None:
         if not isinstance(rendered.kept, FirstBounce):
@@ -212,11 +213,20 @@ def glass_terms(setup: Setup, glass: Glass) -> Terms:
         assert rendered.buffers.normal is not None
         return mesh_normal_loss(rendered.buffers.normal, surfaces.normal, transparent & glass.on_glass(surfaces))
 
+    def held(rendered: RenderedView, view: View) -> Tensor | None:
+        return None if glass.vertices is None else glass.vertices.held()
+
+    def outlined(rendered: RenderedView, view: View) -> Tensor | None:
+        return None if glass.vertices is None else glass.vertices.outlined()
+
     until = loss_start(interface.normal_loss_until, setup.schedule.total)
+    learned = vertices.rate > 0
     terms = (
         ("transmission_depth", loss.transmission_depth, depth, math.inf, RenderOptions()),
         ("interface_hold", interface.normal_hold, hold, until, RenderOptions()),
         ("interface_normal", interface.normal_loss, normal, until, RenderOptions(normal=True)),
+        ("vertex_hold", vertices.hold * learned, held, math.inf, RenderOptions()),
+        ("vertex_outline", vertices.outline * learned, outlined, math.inf, RenderOptions()),
     )
     return [
         LossTerm(name, weight, value, until=end, needs=needs) for name, weight, value, end, needs in terms if weight > 0

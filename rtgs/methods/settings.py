@@ -181,6 +181,26 @@ class InterfaceSettings:
 _EVERY = ("densify_every", "sh_every", "cells", "per_cell", "rebuild_every")
 
 
+@dataclass(frozen=True)
+class VertexSettings:
+    """Vertices of the transparent object's mesh, learned from the photos in the third stage (docs/glass_light.md)."""
+
+    # Of Adam: voxels a step at the start, a tenth of it at the end. 0: the mesh stays as it was found.
+    rate: float = 0.0
+    start: float = 0.1  # share of the stage; before it they stand still
+    spacing: float = 8.0  # voxels between the points at which heights are learned
+    rebuilds: int = 4  # times that the mesh is made anew, the last at the end of the stage
+    hold: float = 1e-4  # weight of the mean square of the heights, voxels
+    outline: float = 1e-2  # weight of the mean square distance from the masks' outlines, pixels
+
+    def __post_init__(self) -> None:
+        refuse_bad_numbers(self, "method.transmittance.vertices")
+        key = "method.transmittance.vertices"
+        refuse_unless(0 <= self.start < 1, f"{key}.start", self.start, "at least 0 and below 1")
+        refuse_unless(self.spacing >= 1, f"{key}.spacing", self.spacing, "at least 1")
+        refuse_unless(self.rebuilds >= 1, f"{key}.rebuilds", self.rebuilds, "at least 1: the mesh of the end")
+
+
 def _transmittance_init() -> InitSettings:
     return InitSettings(scale=0.5)  # a quarter of the hits of each ray at the start
 
@@ -254,6 +274,9 @@ class TransmittanceSettings:
     alpha_cutoff: float = 1 / 255
     interface: InterfaceSettings = field(default_factory=InterfaceSettings)
     wall: WallSettings = field(default_factory=WallSettings, metadata={"recipe": "unless", "value": WallSettings()})
+    vertices: VertexSettings = field(
+        default_factory=VertexSettings, metadata={"recipe": "unless", "value": VertexSettings()}
+    )
     init: InitSettings = field(default_factory=_transmittance_init)
     density: DensitySettings = field(default_factory=_reflection_density)
 
@@ -302,6 +325,29 @@ class MethodSettings:
             raise RtgsError(
                 "method.transmittance.wall.light=fresnel gives shares of linear light, but "
                 f"method.optics.blend={self.optics.blend}: set it to linear, or wall.light=learned"
+            )
+        self._refuse_unfit_vertices()
+
+    def _refuse_unfit_vertices(self) -> None:
+        """Raises :class:`RtgsError` where the mesh's vertices are learned, and something shows them not, or wrong."""
+        glass = self.transmittance
+        if glass.vertices.rate == 0:
+            return
+        moves = f"method.transmittance.vertices.rate={glass.vertices.rate:g} moves the object's mesh"
+        if glass.normal != "mesh":
+            raise RtgsError(
+                f"{moves}, but method.transmittance.normal={glass.normal} shows none of it: set it to mesh, or the "
+                "rate to 0"
+            )
+        if glass.rim_samples > 0:
+            raise RtgsError(
+                f"{moves}, but method.transmittance.rim_samples={glass.rim_samples} takes samples of a mesh that "
+                "stays: set one of them to 0"
+            )
+        if glass.wall.roughness > 0:  # a loss on one sample a pixel asks for a mesh that scatters them less
+            raise RtgsError(
+                f"{moves}, but method.transmittance.wall.roughness={glass.wall.roughness:g} shows one sample a step, "
+                "which teaches it wrong: set one of them to 0"
             )
 
     @property

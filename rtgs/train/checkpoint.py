@@ -226,21 +226,22 @@ def check_resumable(
 
 def _differences(old: str, new: str, settings: RunSettings) -> list[str]:
     """The first few settings that differ, as 'key: old then, new now'; see :func:`_added_settings` for newer keys."""
-
-    def flat(value: object, prefix: str = "") -> dict[str, object]:
-        if isinstance(value, dict):
-            items = value.items()
-        elif isinstance(value, (list, tuple)):
-            items = enumerate(value)
-        else:
-            return {prefix: value}
-        return {key: leaf for name, child in items for key, leaf in flat(child, f"{prefix}.{name}".lstrip(".")).items()}
-
-    added = {key: leaf for name, value in _added_settings(settings) for key, leaf in flat(value, name).items()}
-    before, after = ({**added, **flat(parse_json(text))} for text in (old, new))
+    added = dict(_added_settings(settings))
+    before, after = ({**added, **_leaves(parse_json(text))} for text in (old, new))
     keys = [key for key in sorted(before.keys() | after.keys()) if before.get(key) != after.get(key)]
     shown = [f"{key}: {before.get(key)} then, {after.get(key)} now" for key in keys[:5]]
     return shown + ([f"and {len(keys) - 5} more"] if len(keys) > 5 else [])
+
+
+def _leaves(value: object, prefix: str = "") -> dict[str, object]:
+    """Dotted keys of nested mappings and lists."""
+    if isinstance(value, dict):
+        items = value.items()
+    elif isinstance(value, (list, tuple)):
+        items = enumerate(value)
+    else:
+        return {prefix: value}
+    return {key: leaf for name, child in items for key, leaf in _leaves(child, f"{prefix}.{name}".lstrip(".")).items()}
 
 
 def _added_settings(value: object, prefix: str = "") -> Iterator[tuple[str, object]]:
@@ -249,7 +250,8 @@ def _added_settings(value: object, prefix: str = "") -> Iterator[tuple[str, obje
     for item in fields(value) if is_dataclass(value) else ():
         key, inner = f"{prefix}{item.name}", getattr(value, item.name)
         if (before := left_out_at(item)) is not MISSING:
-            yield key, before
+            whole = is_dataclass(before) and not isinstance(before, type)
+            yield from _leaves(asdict(before) if whole else before, key).items()  # pyright: ignore
         yield from _added_settings(inner, f"{key}.")
 
 

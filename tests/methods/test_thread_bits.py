@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import pytest
 import torch
@@ -10,7 +11,7 @@ from glass_cases import begun, fresnel, glass_recipe, glass_scene, randomised
 from reflective_cases import train_step
 from torch import Tensor
 
-from rtgs.methods.settings import MethodSettings
+from rtgs.methods.settings import MethodSettings, VertexSettings
 
 STEP = 56
 
@@ -22,7 +23,14 @@ def restore_threads() -> Iterator[None]:
     torch.set_num_threads(before)
 
 
-@pytest.mark.parametrize("recipe", [glass_recipe(), fresnel()], ids=["learned", "fresnel"])
+def moving() -> MethodSettings:
+    """The mesh of the object moves."""
+    base = fresnel()
+    vertices = VertexSettings(rate=0.1, start=0.0, spacing=20.0, rebuilds=10)
+    return replace(base, transmittance=replace(base.transmittance, vertices=vertices))
+
+
+@pytest.mark.parametrize("recipe", [glass_recipe(), fresnel(), moving()], ids=["learned", "fresnel", "moving"])
 def test_steps_of_the_third_stage(recipe: MethodSettings):
     found: list[dict[str, Tensor]] = []
     for threads in (1, 2, 7):

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from rtgs.methods.settings import MethodSettings, TransmittanceSettings
+from rtgs.methods.settings import MethodSettings, TransmittanceSettings, VertexSettings
 from rtgs.optics.settings import WallSettings
 from rtgs.train import checkpoint as module
 from rtgs.train.checkpoint import (
@@ -212,6 +212,18 @@ def test_a_setting_that_is_new_since_the_checkpoint_counts_as_its_default():
     del old["method"]["optics"]["weight"]
     with pytest.raises(CheckpointError, match=r"method\.optics\.weight: None then"):  # not marked as a later one
         check_resumable(replace(before, settings=json.dumps(old)), record, PLAIN, warn=pytest.fail)
+
+
+def test_a_group_of_settings_that_is_new_counts_as_its_default_too():
+    record = make(settings=RunSettings(MethodSettings(), ScheduleSettings(), 0)).record
+    values = json.loads(record.settings)
+    assert "vertices" not in values["method"]["transmittance"] or values["method"]["transmittance"].pop("vertices")
+    before = replace(record, settings=json.dumps(values, sort_keys=True), settings_digest="another")
+    check_resumable(before, record, PLAIN, warn=pytest.fail)
+    moving = replace(MethodSettings().transmittance, normal="mesh", vertices=VertexSettings(rate=0.03))
+    other = RunSettings(MethodSettings(transmittance=moving), PLAIN.schedule, PLAIN.seed)
+    with pytest.raises(CheckpointError, match=r"transmittance\.vertices\.rate: 0\.0 then, 0\.03 now"):
+        check_resumable(before, make(settings=other).record, other, warn=pytest.fail)
 
 
 def test_another_scene_is_refused():

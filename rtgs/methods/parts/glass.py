@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import torch
@@ -18,15 +19,8 @@ from rtgs.mesh.container import ObjectGuide, ObjectMesh, ObjectSurfaces
 from rtgs.mesh.silhouettes import bounding
 from rtgs.methods.parts.base import BaseSet, composited
 from rtgs.methods.parts.gaussian_set import GaussianSet, densified, opacity_reset
-from rtgs.methods.parts.glass_evidence import (
-    NOT_MASKED,
-    glass_faces,
-    has_masks,
-    near_surface,
-    on_surface,
-    seen_bare,
-    why_left_out,
-)
+from rtgs.methods.parts.glass_evidence import glass_faces, kept_in_base, left_out, reason_against
+from rtgs.methods.parts.glass_pixels import object_pixels
 from rtgs.methods.parts.glass_sets import drawn_in_box, interface_set, taken_from_base, transmittance_set
 from rtgs.methods.parts.interface_set import InterfaceSet, interface_surfels
 from rtgs.methods.parts.mirror import Mirror, Reflected, stored_surfels
@@ -34,20 +28,14 @@ from rtgs.methods.parts.part import Frame, Part, Raster, Rows
 from rtgs.methods.parts.rough_walls import GlassView, Scatter, bent_rays
 from rtgs.methods.parts.straight_rays import FarWall, StraightRays
 from rtgs.methods.parts.traced_set import FollowingTree, TracedSet
+from rtgs.methods.parts.vertices import LearnedVertices, hidden_pixels, why_not
 from rtgs.methods.parts.wall_light import InnerRays, WallLight, walls_of
 from rtgs.methods.plans import transmittance_plan
+from rtgs.methods.shading.bent import Bend, bent_paths
 from rtgs.methods.shading.lights import Light, Traced, lit_view, mean_of_lights
 from rtgs.methods.shading.mirror import SurfacePixels, reflected_weight
 from rtgs.methods.shading.outline import Outline, with_beside
-from rtgs.methods.shading.straight import (
-    GlassPixels,
-    GlassRays,
-    Transmission,
-    glass_pixels,
-    glass_rays,
-    glass_weights,
-    widened,
-)
+from rtgs.methods.shading.straight import GlassPixels, GlassRays, Transmission, glass_rays, glass_weights
 from rtgs.train.method import Mode, Observation, RenderedView, RenderOptions, Stage, StepEvent
 from rtgs.train.parameters import ParameterGroup
 from rtgs.train.schedule import (
@@ -75,9 +63,10 @@ class Glass(Part):
     base set. Without an object mesh the part stays idle.
 
     Attributes:
-        guide: of the object's mesh; None: without one.
+        guide: of the object's mesh as it is; None: without one.
         transmittance, interface: the sets; None before the stage, and where settings leave them out.
         wall: how its walls reflect; None: by learned weights.
+        vertices: of its mesh, where they are learned; None: they stay.
         begun: the stage has begun.
     """
 
@@ -96,17 +85,18 @@ class Glass(Part):
         self.transmittance: TracedSet | None = None
         self.interface: InterfaceSet | None = None
         self.wall: WallLight | None = None
+        self.vertices: LearnedVertices | None = None
         self.begun = False
         self._stage = stage
         self._from_base = False  # the transmittance set was taken from the base set
         self._glass = torch.zeros(0, dtype=torch.bool)  # (F,) faces of the mesh that are the object's surface
         self._base_tree = FollowingTree(settings.transmittance.rebuild_every)
-        self._left_out: float | None = None  # why, where the stage was: as :meth:`_reason_against`
+        self._left_out: float | None = None  # why, where the stage was: of :func:`reason_against`
         self._points = setup.scene.points
         self._views = setup.scene.train
-        self._masked = has_masks(setup.scene.train)
+        self._found: ObjectGuide | None = None  # of the mesh as it was found
         if setup.object_mesh is not None and settings.transmittance.enabled:
-            self.guide = ObjectGuide(setup.object_mesh)
+            self.guide = self._found = ObjectGuide(setup.object_mesh)
             frozen = self.plan.start if settings.transmittance.freeze_base else None
             mirror.replan(self.plan.base, frozen)
 
@@ -116,15 +106,20 @@ class Glass(Part):
 
     @property
     def groups(self) -> tuple[ParameterGroup, ...]:
-        return () if self.wall is None else self.wall.groups
+        return tuple(group for each in self._learners for group in each.groups)
+
+    @property
+    def _learners(self) -> tuple[WallLight | LearnedVertices, ...]:
+        """What of the object learns and decides beside its sets."""
+        return tuple(each for each in (self.wall, self.vertices) if each is not None)
 
     @property
     def decisions(self) -> tuple[Decision, ...]:
-        if self._left_out is None:
-            asking = self.settings.single_rays if self.settings.transmittance.contents == "rasterized" else ""
-            traced = (Decision("contents are traced", f"{asking} needs the hits of single rays"),) if asking else ()
-            return traced if self.wall is None else (*traced, *self.wall.decisions)
-        return (Decision("no transmittance stage", why_left_out(self._left_out)),)
+        if self._left_out is not None:
+            return (left_out(self._left_out),)
+        asking = self.settings.single_rays if self.settings.transmittance.contents == "rasterized" else ""
+        traced = (Decision("contents are traced", f"{asking} needs the hits of single rays"),) if asking else ()
+        return (*traced, *(decision for each in self._learners for decision in each.decisions))
 
     def mask(self, view: View) -> Tensor | None:
         """L_spec acts in masks that bound something, unless the stage was left out."""
@@ -138,7 +133,8 @@ class Glass(Part):
             return
         if self.guide is None:
             raise RtgsError("the transmittance stage needs the transparent object's mesh: run extract_mesh before it")
-        if (share := self._reason_against(stage.from_step)) is not None:
+        border = self.settings.transmittance.opaque_share
+        if (share := reason_against(self.guide, self._views, self.base, border, stage.from_step)) is not None:
             self._leave_out(share)
             yield StepEvent("decision", "transmittance", f"left out: {self.decisions[-1].why}")
             return
@@ -146,12 +142,33 @@ class Glass(Part):
         self.begun = True
         mesh, settings = self.guide.mesh, self.settings.transmittance
         self._glass = glass_faces(self.guide, self._views, settings.interface.masked_share)
-        self.wall = walls_of(self.settings.transmittance, self.guide, self._glass, self._views)
-        kept = self._seen_bare(stage.from_step)  # before the interface hides what is in the object
+        depths = partial(self.base.median_depth, step=stage.from_step)
+        yield from self._put_vertices(lambda found: hidden_pixels(found, self._views, depths))
+        self._put_walls()
+        least = settings.keep_seen if settings.split else 0
+        kept = kept_in_base(self.base, self._views, least, depths)  # before the interface hides what is in the object
         if settings.interface.count > 0:
             yield self._add_interface(mesh)
         if settings.first_bounce == "transmittance":
             yield self._add_transmittance(mesh, kept)
+
+    def _put_vertices(self, hidden: Callable[[ObjectMesh], Tensor]) -> Iterator[StepEvent]:
+        """Vertices of the mesh that was found, to be learned, where the settings ask for it."""
+        assert self._found is not None
+        settings, mesh, self.vertices = self.settings.transmittance.vertices, self._found.mesh, None
+        if settings.rate == 0:
+            return
+        if why := why_not(mesh):
+            yield StepEvent("decision", "transmittance", f"vertices of the mesh are not learned: {why}")
+            return
+        stage = (self.plan.start, self.schedule.total)
+        self.vertices = LearnedVertices(settings, mesh, self._views, stage, hidden(mesh))
+
+    def _put_walls(self) -> None:
+        """Walls that reflect as thin glass does, where the settings ask for them."""
+        assert self._found is not None
+        moving = self.vertices is not None
+        self.wall = walls_of(self.settings.transmittance, self._found, self._glass, self._views, moving=moving)
 
     def _add_interface(self, mesh: ObjectMesh) -> StepEvent:
         gaussians = self.base.set.gaussians
@@ -163,35 +180,10 @@ class Glass(Part):
             detail += f", none on {opaque} of its {len(self._glass)} faces: they are not masked where they are seen"
         return StepEvent("begin", "interface", detail)
 
-    def _reason_against(self, step: int) -> float | None:
-        """``NOT_MASKED``, or the share of masked pixels that look opaque, where the stage is left out; else None."""
-        if not self._masked:
-            return NOT_MASKED
-        border = self.settings.transmittance.opaque_share
-        assert self.guide is not None
-        if border >= 1 or self.guide.mesh.source == "tsdf":  # that mesh is what the photos show, whatever it is
-            return None
-
-        def weights(camera: Camera, depth: Tensor, reach: float) -> tuple[Tensor, Tensor]:
-            means = self.base.set.gaussians.means.detach()
-            return self.base.weight_of(near_surface(means, camera, depth, reach), camera, step)
-
-        share = on_surface(self.guide, self._views, weights)
-        return share if share is not None and share > border else None
-
     def _leave_out(self, share: float) -> None:
         """Go on as in the second stage, as a run that ends with it."""
         self._left_out = share
         self.mirror.replan(self.schedule)
-
-    def _seen_bare(self, step: int) -> Tensor:
-        """(N,) bool: base surfels that enough training views show with nothing transparent before them."""
-        settings = self.settings.transmittance
-        if settings.keep_seen == 0 or not settings.split:
-            return torch.zeros(len(self.base.set), dtype=torch.bool)
-        means = self.base.set.gaussians.means.detach()
-        counts = seen_bare(means, self._views, lambda camera: self.base.median_depth(camera, step))
-        return counts >= settings.keep_seen
 
     def _add_transmittance(self, mesh: ObjectMesh, kept: Tensor) -> StepEvent:
         cameras = [view.camera for view in self._views]
@@ -218,14 +210,15 @@ class Glass(Part):
             return None
         mirror, rays, shape = self.mirror, frame.rays, (frame.camera.height, frame.camera.width)
         flat = mirror.surface(raster.buffers)
-        glass = self.pixels(frame, flat)
+        bend = None if self.vertices is None else self.vertices.bend(frame.step)
+        glass = self.pixels(frame, flat, bend)
         chosen = mirror.choose(frame, raster.buffers, glass.flat, always=glass.inside)
         straight = glass_rays(glass, chosen.index, rays.center, rays.directions)
         if self.wall is not None:
             self.wall.set_for(frame.step if frame.training and frame.step < self.plan.judged else None)
         scatters = [None] if self.wall is None else self.wall.scatters(frame.step if frame.training else None)
         outline = None if self.wall is None else self.wall.outline(frame.camera, chosen.index, glass)
-        shown = GlassView(frame, chosen, glass, straight, outline)
+        shown = GlassView(frame, chosen, glass, straight, outline, bend)
         samples = [self._sample(shown, each) for each in scatters]
         (met, passed, _), lights = samples[0], mean_of_lights([lights for _, _, lights in samples])
         if outline is not None:
@@ -247,6 +240,8 @@ class Glass(Part):
         """What one ray of each kind meets behind each traced pixel, and the lights of it; ``scatter``: rough walls."""
         frame, chosen, rays = shown.frame, shown.chosen, shown.rays
         inner = None if self.wall is None else self.wall.inner_rays(frame.camera, rays, chosen.index[rays.rows])
+        if inner is not None and shown.bend is not None:
+            inner = replace(inner, paths=bent_paths(inner.paths, shown.bend))
         leaving = None if inner is None else inner.leaving(scatter)
         bent = None if scatter is None else bent_rays(shown, scatter)
         met = self.mirror.reflect(frame, chosen, shown.glass.flat, leaving, None if bent is None else bent.mirrored)
@@ -265,30 +260,15 @@ class Glass(Part):
         shape = self.interface.activated(frame.camera.center.float(), self.base.sh_degree(frame.step))
         return Rows(shape, composited(self.interface.gaussians, shape.colors))
 
-    def pixels(self, frame: Frame, flat: SurfacePixels) -> GlassPixels:
+    def pixels(self, frame: Frame, flat: SurfacePixels, bend: Bend | None = None) -> GlassPixels:
         """The pixels of the view's mask in training, of the silhouette or of given masks else."""
-        settings = self.settings.transmittance
         assert self.guide is not None
-        centers, mask = self.guide.surfaces(frame.camera), bounding(frame.mask)
+        centers = self.guide.surfaces(frame.camera)
         surfaces = centers if self.wall is None else self.wall.surfaces(frame.camera)
-        source = "given" if frame.training else frame.options.masks or settings.test_masks
-        as_trained = frame.training or settings.test_masks == "as_trained"
-        if source == "silhouette" or mask is None:  # a view without a mask shows the object all the same
-            inside = surfaces.hit
-        elif as_trained:
-            inside = mask
-        else:
-            inside = mask & surfaces.hit  # method.md 6.3: where the ray misses the mesh nothing is transmitted
-        inside = inside | (surfaces.hit & ~centers.hit)
-        inside = widened(inside, settings.rim if settings.interface.count > 0 else 0)
-        made = glass_pixels(
-            flat,
-            surfaces,
-            inside,
-            self.on_glass(surfaces),
-            first_surface=settings.first_surface,
-            normal=settings.normal,
-        )
+        if bend is not None and self.vertices is not None:
+            surfaces = self.vertices.moved(frame.camera, surfaces, bend)
+        known = self.on_glass(surfaces)
+        made = object_pixels(self.settings.transmittance, frame, flat, surfaces, centers.hit, known)
         return made if self.wall is None else self.wall.on_glass(made, frame.camera)
 
     def on_glass(self, surfaces: ObjectSurfaces) -> Tensor:
@@ -380,7 +360,10 @@ class Glass(Part):
         return shaded
 
     def control(self, following: int) -> Iterator[StepEvent]:
-        """Density control of the transmittance set on its own clock."""
+        """Density control of the transmittance set on its own clock; the mesh of the vertices that were learned."""
+        if self.vertices is not None and self.vertices.due(following) and (said := self.vertices.rebuild()):
+            self._follow()
+            yield StepEvent("mesh", "transmittance", f"vertices learned from the photos: {said}")
         if self.transmittance is None:
             return
         settings, own = self.settings.transmittance.density, self.plan.own
@@ -392,6 +375,13 @@ class Glass(Part):
         if self.transmittance.density.resets_opacity and opacity_reset_due(own, clock):
             yield opacity_reset(self.transmittance, settings)
 
+    def _follow(self) -> None:
+        """The mesh was made anew."""
+        assert self.vertices is not None
+        self.guide = self.vertices.guide
+        if self.wall is not None:
+            self.wall.follow(self.guide)
+
     # ---- state
 
     def state(self) -> dict[str, Tensor]:
@@ -400,8 +390,9 @@ class Glass(Part):
         if not self.begun:
             return {}
         walls = {} if self.wall is None else self.wall.state()
+        vertices = {} if self.vertices is None else self.vertices.state()
         begun = torch.tensor([self._from_base], dtype=torch.uint8)
-        return {_BEGUN: begun, _GLASS: self._glass.to(torch.uint8), **walls}
+        return {_BEGUN: begun, _GLASS: self._glass.to(torch.uint8), **walls, **vertices}
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
         """The stage as far as the state has it."""
@@ -409,10 +400,13 @@ class Glass(Part):
         self._from_base = self.begun and bool(state[_BEGUN])
         self._glass = state[_GLASS].bool() if self.begun else self._glass
         if self.begun:
-            assert self.guide is not None
-            self.wall = walls_of(self.settings.transmittance, self.guide, self._glass, self._views)
+            tuple(self._put_vertices(lambda _: torch.zeros(0, dtype=torch.uint8)))  # its own are in the state
+            self._put_walls()
             if self.wall is not None:
                 self.wall.restore(state)
+            if self.vertices is not None:
+                self.vertices.restore(state)
+                self._follow()
         if _LEFT_OUT in state and self._left_out is None:
             self._leave_out(float(state[_LEFT_OUT]))
         own = stored_surfels(state, "transmittance")

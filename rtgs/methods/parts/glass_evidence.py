@@ -3,7 +3,7 @@ surfels are seen bare, whether one sees into it at all."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,10 +11,12 @@ import torch
 from torch import Tensor
 
 from rtgs.core.cameras import Camera
+from rtgs.core.decisions import Decision
 from rtgs.mesh.container import ObjectGuide
 from rtgs.mesh.silhouettes import bounding
 
 if TYPE_CHECKING:
+    from rtgs.methods.parts.base import BaseSet
     from rtgs.scenes.scene import View
 
 Depths = Callable[[Camera], Tensor]
@@ -23,20 +25,10 @@ SurfaceWeights = Callable[[Camera, Tensor, float], tuple[Tensor, Tensor]]
 """From a camera, the (H, W) z-depth of a surface and a distance: the (H, W) weight of what lies so near to the surface
 in the pixel, and that of all that is in the pixel."""
 
+NOT_MASKED = -1.0  # instead of a share: the stage is left out for want of masks
 _ON_SURFACE = 0.02  # of the depth: a surfel so near to a pixel's depth is what the pixel shows
 _AT_FRONT = 0.15  # of the view's median thickness: what lies deeper is seen through the surface
 _ROUNDS = 3  # of neighbouring faces that vote together
-
-
-NOT_MASKED = -1.0  # the stage is left out for want of masks
-
-
-def why_left_out(share: float) -> str:
-    """In words; ``share`` of the masked pixels looks opaque, or ``NOT_MASKED``."""
-    if share == NOT_MASKED:
-        return "the masks of the training views are empty, or cover all of them"
-    looks = f"the masked object looks opaque: {share:.1%} of what its pixels show is its own surface "
-    return looks + "(method.transmittance.opaque_share)"
 
 
 def masked_views(views: Iterable[View]) -> Iterator[tuple[View, Tensor]]:
@@ -86,6 +78,13 @@ def seen_bare(points: Tensor, views: Iterable[View], depths: Depths) -> Tensor:
     return counts
 
 
+def kept_in_base(base: BaseSet, views: Iterable[View], least: int, depths: Depths) -> Tensor:
+    """(N,) bool: base surfels that at least so many views show with nothing transparent before them; 0: none."""
+    if least == 0:
+        return torch.zeros(len(base.set), dtype=torch.bool)
+    return seen_bare(base.set.gaussians.means.detach(), views, depths) >= least
+
+
 def on_surface(guide: ObjectGuide, views: Iterable[View], weights: SurfaceWeights) -> float | None:
     """Share of what the masked pixels with two surfaces show that lies on the object's first one: near 1 for an opaque
     thing, which shows nothing behind its surface. None: no such pixel."""
@@ -107,3 +106,28 @@ def near_surface(points: Tensor, camera: Camera, depth: Tensor, reach: float) ->
     at = camera.pixels(camera.to_camera(points.double()))
     surface = depth.reshape(-1)[at.index]
     return at.framed & (surface > 0) & ((at.depth.float() - surface).abs() < reach)
+
+
+def reason_against(guide: ObjectGuide, views: Sequence[View], base: BaseSet, border: float, step: int) -> float | None:
+    """Why the third stage is left out: ``NOT_MASKED``, or the share of what the masked pixels show that is the object's
+    own surface, where it is above ``border``; None: it is not."""
+    if not has_masks(views):
+        return NOT_MASKED
+    if border >= 1 or guide.mesh.source == "tsdf":  # that mesh is what the photos show, whatever it is
+        return None
+
+    def weights(camera: Camera, depth: Tensor, reach: float) -> tuple[Tensor, Tensor]:
+        means = base.set.gaussians.means.detach()
+        return base.weight_of(near_surface(means, camera, depth, reach), camera, step)
+
+    share = on_surface(guide, views, weights)
+    return share if share is not None and share > border else None
+
+
+def left_out(share: float) -> Decision:
+    """Why there is no third stage: ``share`` of what the masked pixels show is a surface, or ``NOT_MASKED``."""
+    why = "the masks of the training views are empty, or cover all of them"
+    if share != NOT_MASKED:
+        why = f"the masked object looks opaque: {share:.1%} of what its pixels show is its own surface "
+        why += "(method.transmittance.opaque_share)"
+    return Decision("no transmittance stage", why)

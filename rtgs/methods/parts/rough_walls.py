@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from rtgs.methods.parts.part import Frame
+from rtgs.methods.shading.bent import Bend
 from rtgs.methods.shading.mirror import MirrorRays, SurfacePixels
 from rtgs.methods.shading.outline import Outline
 from rtgs.methods.shading.straight import GlassPixels, GlassRays
@@ -115,6 +116,7 @@ class GlassView:
     glass: GlassPixels
     rays: GlassRays  # straight ones, behind the near wall
     outline: Outline | None  # None: one ray stands for each pixel there too
+    bend: Bend | None  # what the vertices of the object's mesh do; None: they stay
 
 
 @dataclass(frozen=True)

@@ -59,12 +59,23 @@ class WallLight:
     """The walls of one object."""
 
     def __init__(
-        self, settings: WallSettings, guide: ObjectGuide, glass: Tensor, views: Sequence[View], samples: int = 0
+        self,
+        settings: WallSettings,
+        guide: ObjectGuide,
+        glass: Tensor,
+        views: Sequence[View],
+        samples: int = 0,
+        *,
+        moving: bool = False,
     ) -> None:
-        """``samples`` of each pixel at the outline, a square number; 0: none are taken there."""
+        """``samples`` of each pixel at the outline, a square number; 0: none are taken there. ``moving``: the vertices
+        of the mesh are learned; then there are no samples, which do not follow them."""
+        assert not (moving and samples)
         self.settings = settings
         self._coverage = CoverageGuide(guide, math.isqrt(samples)) if samples > 0 else None
+        self._mesh = guide.mesh  # as it was found
         self._guide = guide
+        self._moving = moving
         self._glass = glass
         self._views = views
         self._openings: Openings | None = None
@@ -102,7 +113,7 @@ class WallLight:
 
     @cached_property
     def _parts(self) -> list[Tensor]:
-        return upward_parts(self._guide.mesh, self._views)
+        return upward_parts(self._mesh, self._views)
 
     @cached_property
     def _upward(self) -> Tensor:
@@ -122,9 +133,9 @@ class WallLight:
             self._tried = opened
             return look(view)
 
-        mesh, least = self._guide.mesh, self.settings.opening_gain
+        least = self.settings.opening_gain
         try:
-            found = judged_openings(mesh, self._parts, self._views, shown, least)
+            found = judged_openings(self._mesh, self._parts, self._views, shown, least)
         finally:
             self._tried = None
         self._adopt(found)
@@ -154,8 +165,17 @@ class WallLight:
         if self._follow:
             key = faces.numpy().tobytes()
             before = self._guides.pop(key, None)
-            self._inner = before or InnerGuide(self._guide.mesh, self._glass, self.settings.bounces, faces)
+            mesh, bounces = self._guide.mesh, self.settings.bounces
+            self._inner = before or InnerGuide(mesh, self._glass, bounces, faces, moving=self._moving)
             self._guides = {**dict([*self._guides.items()][-1:]), key: self._inner}  # the last two
+
+    def follow(self, guide: ObjectGuide) -> None:
+        """The vertices of the mesh have moved; its faces are the same."""
+        self._guide, opened = guide, self._opened
+        assert opened is not None
+        self._guides.clear()
+        self._opened = None
+        self._open(opened)
 
     def walls(self, camera: Camera, pixels: Tensor) -> Tensor | float:
         """(P,) float32 of flattened pixels (P,): 1, or 0 where the object's first surface is an opening; 1: nothing is
@@ -258,12 +278,20 @@ class WallLight:
 
 
 def walls_of(
-    settings: TransmittanceSettings, guide: ObjectGuide, glass: Tensor, views: Sequence[View]
+    settings: TransmittanceSettings, guide: ObjectGuide, glass: Tensor, views: Sequence[View], *, moving: bool = False
 ) -> WallLight | None:
-    """Walls that reflect as thin glass does, where the settings ask for them; ``glass`` (F,) bool: where it is."""
+    """Walls that reflect as thin glass does, where the settings ask for them.
+
+    Args:
+        settings: of the stage.
+        guide: of the object's mesh as it was found.
+        glass: (F,) bool: faces of it that are glass.
+        views: of the training.
+        moving: the mesh's vertices are learned.
+    """
     walls = settings.wall
     if walls.light != "fresnel":
         return None
     if settings.first_bounce != "transmittance" or settings.second_bounce == "none":
         walls = replace(walls, bounces=0)  # the set that it would be followed through, or the far wall, is missing
-    return WallLight(walls, guide, glass, views, settings.rim_samples)
+    return WallLight(walls, guide, glass, views, settings.rim_samples, moving=moving)

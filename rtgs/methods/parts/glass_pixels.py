@@ -1,0 +1,62 @@
+"""Which pixels of a view show the transparent object: those of its mask, of its silhouette, or of both."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from rtgs.mesh.container import ObjectSurfaces
+from rtgs.mesh.silhouettes import bounding
+from rtgs.methods.parts.part import Frame
+from rtgs.methods.settings import TransmittanceSettings
+from rtgs.methods.shading.mirror import SurfacePixels
+from rtgs.methods.shading.straight import GlassPixels, glass_pixels, widened
+
+
+def shown_inside(settings: TransmittanceSettings, frame: Frame, hit: Tensor, centers: Tensor) -> Tensor:
+    """(H, W) bool: pixels that get straight rays. Those of the view's mask in training, of the silhouette or of given
+    masks else; and those that show the object beside their centre.
+
+    Args:
+        settings: of the stage.
+        frame: the view.
+        hit: (H, W) bool: pixels that meet the object.
+        centers: (H, W) bool: those of them whose centre does.
+    """
+    mask = bounding(frame.mask)
+    source = "given" if frame.training else frame.options.masks or settings.test_masks
+    as_trained = frame.training or settings.test_masks == "as_trained"
+    if source == "silhouette" or mask is None:  # a view without a mask shows the object all the same
+        inside = hit
+    elif as_trained:
+        inside = mask
+    else:
+        inside = mask & hit  # method.md 6.3: where the ray misses the mesh nothing is transmitted
+    return widened(inside | (hit & ~centers), settings.rim if settings.interface.count > 0 else 0)
+
+
+def object_pixels(
+    settings: TransmittanceSettings,
+    frame: Frame,
+    flat: SurfacePixels,
+    surfaces: ObjectSurfaces,
+    centers: Tensor,
+    known: Tensor,
+) -> GlassPixels:
+    """All pixels of a view, with what is known of the object in them.
+
+    Args:
+        settings: of the stage.
+        frame: the view.
+        flat: its pixels as rasterised.
+        surfaces: where they meet the object.
+        centers: (H, W) bool: those whose centre does.
+        known: (H, W) bool: the first surface there is glass.
+    """
+    return glass_pixels(
+        flat,
+        surfaces,
+        shown_inside(settings, frame, surfaces.hit, centers),
+        known,
+        first_surface=settings.first_surface,
+        normal=settings.normal,
+    )
