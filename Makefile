@@ -3,6 +3,9 @@ PYTHON ?= python3
 TORCH ?= torch==2.13.0
 # asked first: on Linux the package index would bring torch for CUDA, gigabytes of it; TORCH_INDEX= asks the latter alone
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
+# an image installs for good, with more: EDITABLE= EXTRAS=prepare,sweeps,cluster,server
+EDITABLE ?= -e
+EXTRAS ?= prepare,sweeps
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
@@ -11,10 +14,12 @@ NATIVE := $(shell find rtgs/native -name "*.cpp" -o -name "*.h" -o -name "*.cmak
 RUN ?=
 MINUTES ?= 30
 FIRST ?= 0
-# of the tables: PRESET smoke quick standard paper; SEEDS how many; DATA stand_in ref_real nu_nerf (with DATA_ROOT); WORKERS
+HOURS ?= 1
+# of the tables: PRESET smoke quick standard paper (PRESETS several, of time-quality); SEEDS how many; DATA stand_in ref_real nu_nerf (with DATA_ROOT); WORKERS
 PRESET ?= quick
 SEEDS ?= 1
 DATA ?= stand_in
+PRESETS ?= quick,standard
 WORKERS ?= 2
 DATA_ROOT ?= data
 export DATA_ROOT
@@ -35,8 +40,9 @@ WORKER_WORDS = $(if $(findstring hydra/launcher=,$(RUN)),,hydra.launcher.workers
 TABLE = $(BIN)/rtgs run preset=$(PRESET) $(SEED_LIST) $(WORKER_WORDS) $(DATA_WORDS)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-dev demo test fuzz e2e bench lint format docs dashboard accept-steps contact-sheet clean
-.PHONY: reproduce-table1 reproduce-table2 reproduce-table3 reproduce-fig-split-sum
+.PHONY: help setup setup-dev demo test fuzz sanitize soak e2e bench lint format docs dashboard accept-steps contact-sheet web clean
+.PHONY: reproduce-table1 reproduce-table2 reproduce-table3 reproduce-fig-split-sum reproduce-figures
+.PHONY: reproduce-time-quality
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-24s %s\n", $$1, $$2}'
@@ -54,7 +60,7 @@ $(READY): $(NATIVE)
 	$(BIN)/pip install -q --upgrade pip
 	$(if $(TORCH_INDEX),$(BIN)/pip install -q --index-url $(TORCH_INDEX) --timeout 5 --retries 0 "$(TORCH)" || \
 	  { echo "$(TORCH_INDEX) gives no $(TORCH): taking what pip finds (on Linux it may be for CUDA)."; $(BIN)/pip install -q "$(TORCH)"; },$(BIN)/pip install -q "$(TORCH)")
-	$(BIN)/pip install -q -e '.[prepare,sweeps]'
+	$(BIN)/pip install -q $(EDITABLE) '.[$(EXTRAS)]'
 	@touch $(READY)
 	@echo "$(VENV) takes $$(du -sh $(VENV) | cut -f1)B"
 
@@ -84,11 +90,25 @@ reproduce-fig-split-sum: setup ## microfacet weight against split-sum shading
 	$(call of_data,ref_real)$(CHECK_DATA)
 	$(TABLE) experiment=fig_split_sum $(RUN)
 
+reproduce-figures: reproduce-table1 reproduce-table2 reproduce-table3 reproduce-fig-split-sum ## panels of pictures, PNG and PDF, from the runs of all tables (PRESET=)
+	$(BIN)/rtgs figures preset=$(PRESET)
+
+reproduce-time-quality: PRESET := $(PRESETS)
+reproduce-time-quality: setup ## PSNR over CPU time for every method and preset, a plot for each scene (PRESETS= DATA= WORKERS=)
+	$(CHECK_DATA)
+	$(TABLE) experiment=time_quality $(RUN)
+
 test: setup-dev ## the tests
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
 
 fuzz: setup-dev ## damaged files against every reader for MINUTES, ends with counts (FIRST= number of the first input)
 	$(BIN)/python -m tests.fuzz.attack --minutes $(MINUTES) --first $(FIRST)
+
+sanitize: setup-dev ## native tests under ASan and UBSan, portable and AVX-512 (RUN="--isa portable")
+	$(BIN)/python -m tests.native.sanitize $(RUN)
+
+soak: setup-dev ## runs killed, out of disk, racing and with damaged artifacts for HOURS; all must end the same, bit for bit
+	$(BIN)/python -m benchmarks.quality.soak --hours $(HOURS)
 
 e2e: setup-dev ## long end-to-end runs
 	$(BIN)/python -m pytest -m slow
@@ -109,8 +129,9 @@ format: setup-dev ## let ruff put things right
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-docs: setup-dev ## docs/api.md: the reference of what rtgs exports, from its docstrings
+docs: setup-dev ## docs/api.md from the docstrings of what rtgs exports, then all pages as a site: build/site/index.html
 	$(BIN)/python docs/make_api.py
+	$(BIN)/python docs/make_site.py build/site
 
 dashboard: setup ## browse the runs in MLflow on this machine (loopback)
 	$(BIN)/rtgs dashboard
@@ -120,6 +141,11 @@ accept-steps: setup-dev ## accept the changed source of pipeline steps (after bu
 
 contact-sheet: setup-dev ## docs/images/scenes.jpg: every path-traced scene with its layers; prints their figures
 	$(BIN)/python -m rtgs.scenes.contact_sheet docs/images/scenes.jpg
+
+web: ## rtgs/export/web/vendor.js.gz: three.js and Spark for exported pages, with npm, from fixed versions
+	rm -rf build/web && mkdir -p build/web && cp $(addprefix rtgs/export/web/,package.json package-lock.json vendor.js) build/web
+	cd build/web && npm ci --no-audit --no-fund && node_modules/.bin/esbuild vendor.js --bundle --minify --format=esm \
+		--legal-comments=none --outfile=out.js && gzip -9 -n -c out.js > ../../rtgs/export/web/vendor.js.gz
 
 clean: ## remove the environment and build products (not the store)
 	rm -rf $(VENV) build

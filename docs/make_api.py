@@ -28,6 +28,7 @@ GROUPS = {
     "Gaussians": ("rtgs.gaussians",),
     "Rendering": ("rtgs.render",),
     "Training": ("rtgs.train", "rtgs.methods"),
+    "Finished runs": ("rtgs.runs",),
     "Pictures and figures": ("rtgs.evaluate",),
 }
 """Headings by the rooms whose names stand below them."""

@@ -35,7 +35,7 @@ class RtgsDaskLauncher(Launcher):
 
     def __init__(self, **engine: Any) -> None:
         settings = {item.name: engine[item.name] for item in fields(EngineSettings) if item.name in engine}
-        for name in ("hosts", "slurm_directives"):
+        for name in ("hosts", "slurm_directives", "step_threads", "step_memory", "step_limit"):
             settings[name] = list(settings.get(name, []))
         self.settings = EngineSettings(**settings)
         self._context: HydraContext | None = None

@@ -276,8 +276,8 @@ def _summary(folder: Path) -> dict[str, Any]:
 
 def bright_psnr(places: dict[str, Path]) -> float:
     """Mean PSNR over the bright pixels of the views with truth."""
-    from pipelines.steps.views import read_render
     from rtgs.evaluate.metrics import psnr
+    from rtgs.runs.views import read_render
     from rtgs.scenes.canonical import read_scene
 
     scene = read_scene(places["import_scene"])

@@ -33,9 +33,11 @@ if TYPE_CHECKING:
     )
     from rtgs.render.ellipsoids import rasterize_ellipsoids
     from rtgs.render.orbit import Orbit, Picture, orbit_cameras, orbit_of_cameras
+    from rtgs.render.rasterization import rasterization, rasterization_2dgs
     from rtgs.render.splats import render_splats
     from rtgs.render.surfels import rasterize_surfels
     from rtgs.render.trace import SurfelTree, trace_surfels
+    from rtgs.runs.shown import LayeredView, ShownRun, load
     from rtgs.scenes.scene import Scene, View, load_scene
     from rtgs.scenes.settings import SceneSettings
     from rtgs.train.method import Mode, RenderedView, RenderOptions
@@ -51,6 +53,7 @@ __all__ = [
     "EllipsoidOptions",
     "Ellipsoids",
     "InitSettings",
+    "LayeredView",
     "LossSettings",
     "LossTerm",
     "MethodSettings",
@@ -67,6 +70,7 @@ __all__ = [
     "Scene",
     "SceneSettings",
     "ScheduleSettings",
+    "ShownRun",
     "SurfelTree",
     "Surfels",
     "TraceBuffers",
@@ -79,10 +83,13 @@ __all__ = [
     "create_method",
     "gaussians_from_points",
     "generator_for",
+    "load",
     "load_scene",
     "orbit_cameras",
     "orbit_of_cameras",
     "psnr",
+    "rasterization",
+    "rasterization_2dgs",
     "rasterize_ellipsoids",
     "rasterize_surfels",
     "read_gaussians",
@@ -111,9 +118,11 @@ _PLACES = {
     "rtgs.render.buffers": ("EllipsoidBuffers EllipsoidOptions RasterBuffers RasterOptions TraceBuffers TraceOptions"),
     "rtgs.render.ellipsoids": "rasterize_ellipsoids",
     "rtgs.render.orbit": "Orbit Picture orbit_cameras orbit_of_cameras",
+    "rtgs.render.rasterization": "rasterization rasterization_2dgs",
     "rtgs.render.splats": "render_splats",
     "rtgs.render.surfels": "rasterize_surfels",
     "rtgs.render.trace": "SurfelTree trace_surfels",
+    "rtgs.runs.shown": "LayeredView ShownRun load",
     "rtgs.scenes.scene": "Scene View load_scene",
     "rtgs.scenes.settings": "SceneSettings",
     "rtgs.train.method": "Mode RenderOptions RenderedView",

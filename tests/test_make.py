@@ -57,6 +57,9 @@ def test_the_image_is_made_by_the_same_commands():
     dockerfile = (project_root() / "docker" / "Dockerfile").read_text()
     assert "make setup " in dockerfile
     assert "torch" not in dockerfile  # no other version, no other index
+    text = commands("setup", "EDITABLE=", "EXTRAS=prepare,cluster")
+    assert "pip install -q  '.[prepare,cluster]'" in text
+    assert "pip install -q -e '.[prepare,sweeps]'" in commands("setup")
 
 
 def test_sweeps_need_nothing_that_only_the_tools_of_development_bring():

@@ -19,11 +19,11 @@ import torch
 
 from benchmarks.quality.mesh import opaque_depths
 from benchmarks.quality.picture import artifact
-from pipelines.steps.training import load_method
 from rtgs.core.errors import RtgsError
 from rtgs.mesh.container import ObjectMesh
 from rtgs.mesh.score import NormalScore, container_mesh, normal_score
 from rtgs.methods.parts.glass import Glass
+from rtgs.runs.training import load_method
 from rtgs.scenes.canonical import read_scene
 from rtgs.scenes.scene import Scene
 

@@ -19,11 +19,11 @@ import numpy as np
 
 from pipelines.publishing.results import RUN_FILE, RunRecord
 from pipelines.steps.evaluate import TABLE_JSON
-from pipelines.steps.views import read_render
 from rtgs.core.errors import RtgsError
 from rtgs.evaluate.images import ERROR_FULL_SCALE, error_map, to_bytes
 from rtgs.evaluate.records import EvaluationTable, read_json
 from rtgs.report.figures import depth_picture, normal_picture
+from rtgs.runs.views import read_render
 from rtgs.scenes.canonical import read_scene
 
 if TYPE_CHECKING:

@@ -6,17 +6,20 @@ import logging
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from pipelines.cli.view_run import viewed
 from pipelines.planning.plan import describe, remote_store
 from pipelines.planning.sweep import Sweep
 from rtgs.config.schema import Choices, RunConfig
+from rtgs.core.errors import RtgsError
 from rtgs.core.refuse import refuse_below
 from rtgs.track import Tracking, open_tracking
 from rtgs.workflow import InlineExecutor, Plan, RemoteStore, StepResult, Store, SweepOutcomes, make_plan
 
 log = logging.getLogger("rtgs")
+NO_SWEEP = "view=true is for one run: leave --multirun off, or view=true"
 
 
 @dataclass(frozen=True)
@@ -53,6 +56,7 @@ class _Run:
     remote: RemoteStore | None
     tracking: Tracking
     membership: Membership
+    onlooker: object = None
 
     @property
     def place(self) -> str:
@@ -68,8 +72,12 @@ def execute(config: RunConfig, choices: Choices, membership: Membership | None =
         CaptureError: the capture cannot be read.
     """
     from pipelines.planning.graph import build_graph, command
+    from pipelines.publishing.run_names import with_own_name
 
     refuse_below("threads", config.threads, 1)
+    if config.view and membership is not None and membership.sweep is not None:
+        raise RtgsError(NO_SWEEP)
+    config = with_own_name(config, choices, claim=True)
     membership = membership or Membership()
     store, remote = Store(config.paths.store), remote_store(config)
     graph = build_graph(config, choices)
@@ -80,8 +88,9 @@ def execute(config: RunConfig, choices: Choices, membership: Membership | None =
     for decision in (*graph.unread, *graph.moved):
         log.info("%s", decision)
     log.info("%s", describe(plan))
-    run = _Run(config, choices, plan, command(choices), store, remote, open_tracker(config), membership)
-    with _process(None if plan.complete else config):
+    tracking = open_tracker(config)
+    with _process(None if plan.complete else config), viewed(config, plan) as onlooker:
+        run = _Run(config, choices, plan, command(choices), store, remote, tracking, membership, onlooker)
         outcome = _execute(run)
     _show(outcome.results, outcome.folder)
     return outcome
@@ -121,9 +130,11 @@ def _tracked(run: _Run, parent: str) -> RunOutcome:
     from pipelines.publishing.results import note_tracked, run_info, track_end, track_start, write_run_folder
 
     config, choices, plan = run.config, run.choices, run.plan
-    with run.tracking.run(run_info(config, choices, plan, parent)) as tracker:
+    info = run_info(config, choices, plan, parent)
+    before = run.membership.outcomes.seconds(plan)
+    with run.tracking.run(replace(info, seconds_before=before)) as tracker:
         track_start(tracker, config, choices, run.membership.outcomes.as_planned(plan))
-        executor = InlineExecutor(run.store, run.tracking, run.remote)
+        executor = InlineExecutor(run.store, run.tracking, run.remote, onlooker=run.onlooker)
         results = executor.execute(plan)
         folder = write_run_folder(config, choices, run.command, results)
         track_end(tracker, folder, results, executor.artifacts)
@@ -143,11 +154,15 @@ def tracked_place(config: RunConfig, tracking: Tracking) -> str:
 
 def _show(results: Sequence[StepResult], folder: Path) -> None:
     from pipelines.publishing.results import evaluation_of, judge_record, result_table
+    from pipelines.steps.render import PREVIEW
     from pipelines.steps.report import PAGE
 
     record = judge_record(results)
     judged = "".join(f"\n{decision}" for decision in record.decisions()) if record is not None else ""
     print(f"\n{result_table([evaluation_of(results)])}\n{judged}\nreport: {short(folder / PAGE)}")
+    if (folder / PREVIEW).is_file():
+        name = folder.name
+        print(f"preview: {short(folder / PREVIEW)} (films: rtgs show {name}; in the browser: rtgs view {name})")
 
 
 def short(path: Path) -> str:

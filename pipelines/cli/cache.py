@@ -36,6 +36,7 @@ def main(words: list[str], root: Path) -> int:
 def _parser(root: Path) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         "rtgs cache",
+        usage="rtgs cache ls | gc | verify | push [key=value ...] | pull [key=value ...]  [options]",
         description="The artifact store. push and pull take the words of `rtgs run` and move what that run or sweep is "
         "made of; without words, everything.",
     )
@@ -44,7 +45,9 @@ def _parser(root: Path) -> argparse.ArgumentParser:
         choices=("ls", "gc", "verify", "push", "pull"),
         help="list, remove garbage, check every digest, send to or fetch from a remote store",
     )
-    parser.add_argument("words", nargs="*", metavar="key=value", help="push, pull: which run (default: everything)")
+    parser.add_argument(
+        "words", nargs="*", default=[], metavar="key=value", help="push, pull: which run (default: everything)"
+    )
     parser.add_argument("--root", type=Path, default=root, help="folder that holds store/ (default: %(default)s)")
     parser.add_argument("--partial", action="store_true", help="gc: also checkpoints of unfinished steps")
     parser.add_argument("--older-than", type=float, metavar="DAYS", help="gc: also artifacts made before that")
@@ -91,7 +94,7 @@ def _push(store: Store, remote: RemoteStore, words: list[str]) -> int:
             print(f"sent {artifact.manifest.step} {artifact.manifest.fingerprint[:12]}", flush=True)
         else:
             present += 1
-    print(f"{sent} artifacts sent to {remote.url}, {size / 1e6:.1f} MB; {present} were there already")
+    print(f"{sent} artifacts sent to {remote.redacted}, {size / 1e6:.1f} MB; {present} were there already")
     return 0
 
 
@@ -108,7 +111,8 @@ def _pull(store: Store, remote: RemoteStore, words: list[str]) -> int:
         else:
             absent += 1
     missing = f"; {absent} are not there" if absent else ""
-    print(f"{fetched} artifacts fetched from {remote.url}, {size / 1e6:.1f} MB; {present} were here already{missing}")
+    told = f"{fetched} artifacts fetched from {remote.redacted}, {size / 1e6:.1f} MB; {present} were here already"
+    print(told + missing)
     return 0
 
 

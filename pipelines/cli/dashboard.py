@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import os
-import subprocess
 import sys
-from contextlib import suppress
 from pathlib import Path
 
+from pipelines.cli.sweep_summary import FIGURES
+from pipelines.cli.termination import serve_until_interrupted
 from rtgs.core.errors import RtgsError
 from rtgs.track.mlflow import PARENT_TAG, MlflowTracking
+from rtgs.track.mlflow_view import SORTED_BY, artifact_link, view_link
 from rtgs.workflow.executors import STEPS_EXPERIMENT
 
 _PAGE = 1000  # runs counted per experiment
 SWEEP_TAG = "rtgs.sweep"  # of the parent run (pipelines.planning.sweep)
-GUIDE = """In an experiment: the table of runs (choose eval/psnr, eval/ssim under Columns); its chart view, the second
-button, compares figures, curves and pictures (search view_; full screen shows the runs beside each other).
+GUIDE = """Each link above shows the runs of an experiment, best PSNR first, those of sweeps too, figures as columns
+(the view "rtgs: best first" of its menu of views). The second button beside the search compares figures, curves and
+pictures (search view_; full screen shows the runs beside each other).
 In a run: Model metrics has the curves (train/psnr, train/loss) and the sliders (<view>/<layer>, one stop per step);
 Artifacts has tables/eval.json with every test view, report.html the page, point_cloud.ply the model, config.yaml every
-key. The parent run of a sweep holds table.html."""
+key. The parent run of a sweep holds tables/figures.json, and of an experiment with a table table.html."""
 
 
 def serve(root: Path, port: int) -> int:
@@ -37,29 +39,35 @@ def serve(root: Path, port: int) -> int:
     print("\n".join([f"{address}  (Ctrl-C ends it)", *overview(tracking, address), "", GUIDE]), flush=True)
     command = ("mlflow", "ui", "--workers", "1", "--host", "127.0.0.1", "--port", str(port))
     quiet = {"MLFLOW_DISABLE_TELEMETRY": "true", "DO_NOT_TRACK": "true", "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}
-    with suppress(KeyboardInterrupt):
-        server = [sys.executable, "-m", *command, "--backend-store-uri", f"sqlite:///{database}"]
-        return subprocess.run(server, env=os.environ | quiet).returncode
-    return 0
+    server = [sys.executable, "-m", *command, "--backend-store-uri", f"sqlite:///{database}"]
+    return serve_until_interrupted(server, os.environ | quiet)
 
 
 def overview(tracking: MlflowTracking, address: str) -> list[str]:
-    """One line per experiment: how many sweeps and runs, the newest and the best of them, and its page."""
+    """Of each experiment: how many sweeps and runs, its page, the best run and its pictures, the newest table."""
     lines = []
     for experiment in tracking.client.search_experiments():
         runs = list(tracking.client.search_runs([experiment.experiment_id], max_results=_PAGE))
         if not runs:
             continue
-        page = f"{address}/#/experiments/{experiment.experiment_id}/runs"
+        number = experiment.experiment_id
         if experiment.name == STEPS_EXPERIMENT:
+            page = f"{address}/#/experiments/{number}/runs"
             lines.append(f"  {experiment.name}: {len(runs)} executed steps  {page}")
             continue
+        tracking.carry_view(experiment)
         variants = [run for run in runs if SWEEP_TAG not in run.data.tags]
         sweeps = {run.data.tags.get(PARENT_TAG) for run in variants} - {None}
         text = f"  {experiment.name}: {len(variants)} runs" + (f" in {len(sweeps)} sweeps" if sweeps else "")
-        measured = [run for run in variants if "eval/psnr" in run.data.metrics]
-        if measured:
-            best = max(measured, key=lambda run: run.data.metrics["eval/psnr"])
-            text += f", best {best.info.run_name} with {best.data.metrics['eval/psnr']:.2f} dB"
-        lines.append(f"{text}  {page}")
+        measured = [run for run in variants if SORTED_BY in run.data.metrics]
+        best = max(measured, key=lambda run: run.data.metrics[SORTED_BY], default=None)
+        if best is not None:
+            text += f", best {best.info.run_name} with {best.data.metrics[SORTED_BY]:.2f} dB"
+        lines.append(f"{text}  {view_link(address, number)}")
+        if best is not None:
+            lines.append(f"    its pictures: {artifact_link(address, number, best.info.run_id, 'images')}")
+        newest = next((run for run in runs if SWEEP_TAG in run.data.tags), None)
+        if newest is not None:
+            shown = artifact_link(address, number, newest.info.run_id, f"tables/{FIGURES}.json")
+            lines.append(f"    table of the newest sweep: {shown}")
     return lines

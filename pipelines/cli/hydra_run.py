@@ -10,9 +10,11 @@ from __future__ import annotations
 import argparse
 import importlib
 import logging
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from hydra import version
 from hydra._internal.callbacks import Callbacks
@@ -25,14 +27,15 @@ from hydra.core.plugins import Plugins
 from hydra.types import HydraContext, RunMode, TaskFunction
 from omegaconf import DictConfig, OmegaConf
 
-from pipelines.cli.app import Membership, RunOutcome, execute, short
+from pipelines.cli.app import NO_SWEEP, Membership, RunOutcome, execute, short
 from pipelines.cli.sweep_summary import finished_elsewhere, same_folders, side_by_side, write_tables
 from pipelines.planning.sweep import Sweep
 from rtgs.config.compose import VERSION_BASE, choices_from
-from rtgs.config.convert import to_run_config
+from rtgs.config.convert import hide_credentials, to_run_config
 from rtgs.config.locate import conf_dir
 from rtgs.config.schema import register_schema
 from rtgs.config.words import friendly_overrides
+from rtgs.core.credentials import redact
 from rtgs.core.errors import RtgsError
 from rtgs.workflow import SweepOutcomes
 
@@ -67,6 +70,8 @@ class HydraApp:
 
     def _job(self, composed: DictConfig, outcomes: SweepOutcomes) -> None:
         hydra = HydraConfig.get()
+        hide_credentials(composed)
+        _redact_files(hydra)
         sweep = Sweep.of(hydra) if hydra.mode == RunMode.MULTIRUN else None
         try:
             config, choices = to_run_config(composed, choices_from(hydra.runtime.choices, hydra.overrides.task))
@@ -75,7 +80,7 @@ class HydraApp:
             if sweep is None:
                 self.error = error
                 return
-            self.failures.append(f"job {hydra.job.num} ({hydra.job.override_dirname}): {error}")
+            self.failures.append(redact(f"job {hydra.job.num} ({hydra.job.override_dirname}): {error}"))
             log.error("%s", self.failures[-1])
             sweep.leave_error(int(hydra.job.num), error)
             raise
@@ -207,10 +212,16 @@ def _start(hydra: Hydra, name: str, options: argparse.Namespace, app: HydraApp) 
 
 
 def _sweep(hydra: Hydra, name: str, overrides: list[str], app: HydraApp) -> None:
-    """What ``Hydra.multirun`` does, where the app learns of its sweep before any job."""
+    """What ``Hydra.multirun`` does, where the app learns of its sweep before any job.
+
+    Raises:
+        RtgsError: ``view=true``, before workers train for hours.
+    """
+    if any(re.fullmatch(r"\+*view=(true|1|yes|on)", word, re.IGNORECASE) for word in overrides):
+        raise RtgsError(NO_SWEEP)
     config = hydra.compose_config(name, overrides, RunMode.MULTIRUN, with_log_configuration=True)
     app.sweep = Sweep.of(config.hydra)
-    app.sweep.forget_errors()
+    app.sweep.begin()
     callbacks = Callbacks(config)
     callbacks.on_multirun_start(config=config, config_name=name)
     context = HydraContext(config_loader=hydra.config_loader, callbacks=callbacks)
@@ -219,6 +230,23 @@ def _sweep(hydra: Hydra, name: str, overrides: list[str], app: HydraApp) -> None
     assert isinstance(words, list)
     sweeper.sweep(arguments=words)
     callbacks.on_multirun_end(config=config, config_name=name)
+
+
+def _redact_files(hydra: Any) -> None:
+    """Hydra has written the config of this job beside its log, with what files of the user's hold.
+
+    Only what it wrote is changed: the folders may be the user's own.
+    """
+    written: list[Path] = []
+    if hydra.output_subdir:
+        folder = Path(hydra.runtime.output_dir) / str(hydra.output_subdir)
+        written += [folder / name for name in ("config.yaml", "hydra.yaml", "overrides.yaml")]
+    if hydra.mode == RunMode.MULTIRUN:
+        written.append(Path(hydra.sweep.dir) / "multirun.yaml")
+    for path in written:
+        text = path.read_text(encoding="utf-8") if path.is_file() else ""
+        if redact(text) != text:
+            path.write_text(redact(text), encoding="utf-8")
 
 
 def _know_own_launcher() -> None:

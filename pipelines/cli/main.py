@@ -1,16 +1,20 @@
-"""The ``rtgs`` command: run, plan, cache, check, show, weights, report, dashboard."""
+"""The ``rtgs`` command: run, plan, figures, cache, get, check, show, view, export, weights, report, dashboard."""
 
 from __future__ import annotations
 
 import argparse
+import difflib
 import errno
 import os
+import re
 import sys
 import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
 
+from pipelines.cli.termination import EXIT_CODE, Terminated, sigterm_raises
+from rtgs.core.credentials import redact, words_without_credentials
 from rtgs.core.errors import RtgsError
 from rtgs.core.version import VERSION
 
@@ -19,12 +23,19 @@ USAGE = f"""rtgs {VERSION}: Gaussian models of scenes with glass and mirrors, on
   rtgs run [group=choice] [key=value]     train, render, measure, report; what is cached is not run again
   rtgs run synthesize scene=NAME|all      path-trace a described scene into a capture with known truth
   rtgs plan [--multirun] [key=value]      what `rtgs run` with the same words would do, and why
+  rtgs explain [KEY] [key=value]          what a key means, its value and default, where it is set
+  rtgs figures [NAME] [key=value]         the paper's pictures as panels, from runs that are in the store
+  rtgs get [NAME] [to=FOLDER]             real captures by name: download, compare digests, go on where it stopped
   rtgs check FOLDER | scene=NAME | data=  what is wrong with a capture, before any training
   rtgs report [RUN]                       where the report of the latest (or the named) run is
+  rtgs show [RUN] [path=] [layer=]        films and pictures of a run from anywhere, layer by layer
   rtgs show FILE.ply [--scene NAME]       pictures of any Gaussian splat; with a scene, measured on its test views
+  rtgs view [RUN]                         a run in the browser, its layers as switches; of one in training: view=true
+  rtgs export [RUN] [format=]             a run for other programs: ply spz glb html ...
   rtgs cache ls|gc|verify|push|pull       the artifact store, and the one that machines share
   rtgs weights status                     pretrained files: what is known, what is there; downloads nothing
   rtgs dashboard                          MLflow's pages on this machine
+  rtgs completion bash|zsh|fish           completion of all this with Tab
 
   rtgs COMMAND --help tells more. RTGS_DEBUG=1 shows tracebacks."""
 
@@ -38,17 +49,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if words[0] == "--version":
         print(VERSION)
         return 0
-    command = COMMANDS.get(words[0])
+    command = (COMMANDS | HIDDEN).get(words[0])
     if command is None:
-        print(f"rtgs: unknown command {words[0]!r}\n\n{USAGE}", file=sys.stderr)
+        print(f"rtgs: {_unknown(words[0])}", file=sys.stderr)
         return 2
     # Threads of OpenMP that wait by spinning starve each other as soon as a machine has anything else to do (measured:
     # ten times slower under load); must be set before torch is loaded.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     try:
-        return command(words[1:])
-    except KeyboardInterrupt:
-        print("\nrtgs: interrupted; the same command goes on from the last checkpoint", file=sys.stderr)
+        with sigterm_raises():
+            return command(words_without_credentials(words[1:]))
+    except Terminated:
+        print("\nrtgs: terminated; the same command goes on from the last checkpoint", file=sys.stderr)
+        return EXIT_CODE
+    except KeyboardInterrupt as ended:
+        print(
+            f"\nrtgs: {str(ended) or 'interrupted'}; the same command goes on from the last checkpoint", file=sys.stderr
+        )
         return 130
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -57,12 +74,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return report_error(error)
 
 
+def _unknown(word: str) -> str:
+    """What to say of a command that there is not."""
+    close = difflib.get_close_matches(word, COMMANDS, n=1)
+    if close:
+        return f"unknown command {word!r}: did you mean `rtgs {close[0]}`?"
+    hint = "; to train on a folder: rtgs run FOLDER" if Path(word).exists() else ""
+    return f"unknown command {word!r}{hint}\n\n{USAGE}"
+
+
 def report_error(error: Exception) -> int:
     """Print an error: one message where the user can mend it, a traceback where the program is at fault."""
     if os.environ.get("RTGS_DEBUG") or not is_for_users(error):
-        traceback.print_exception(error)
+        text = "".join(traceback.format_exception(error)).rstrip()
     else:
-        print(f"rtgs: {_message(error)}", file=sys.stderr)
+        text = f"rtgs: {_message(error)}"
+    print(redact(text), file=sys.stderr)
     return 1
 
 
@@ -76,7 +103,7 @@ def _message(error: Exception) -> str:
     inner = getattr(error, "error", error)
     if _disk_is_full(inner):
         return f"{error}; free some space, then the same command goes on where it was"
-    if isinstance(inner, OSError) and inner.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+    if _system_error(inner) in (errno.EACCES, errno.EPERM, errno.EROFS):
         return f"{error}; make it writable, or choose another folder for store and runs with RTGS_ROOT or paths.root"
     if _memory_is_full(inner):
         return (
@@ -92,7 +119,16 @@ def _memory_is_full(error: BaseException) -> bool:
 
 
 def _disk_is_full(error: BaseException) -> bool:
-    return (isinstance(error, OSError) and error.errno == errno.ENOSPC) or "No space left on device" in str(error)
+    """Full, or a quota or a limit on the size of files is reached."""
+    return _system_error(error) in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) or "No space left on device" in str(error)
+
+
+def _system_error(error: BaseException) -> int | None:
+    """Number of the system's error, also where a library written in Rust (safetensors) only says it; None: no such."""
+    if isinstance(error, OSError):
+        return error.errno
+    said = re.search(r"\(os error (\d+)\)", str(error))
+    return int(said.group(1)) if said else None
 
 
 def is_for_users(error: BaseException) -> bool:
@@ -102,7 +138,7 @@ def is_for_users(error: BaseException) -> bool:
         return True
     if _memory_is_full(inner):
         return True
-    if _disk_is_full(inner):  # safetensors has an exception of its own for it
+    if _disk_is_full(inner) or _system_error(inner) is not None:
         return True
     return isinstance(inner, (ValueError, TypeError)) and _raised_in_project(inner.__traceback__)
 
@@ -144,6 +180,16 @@ def plan(words: list[str]) -> int:
     return plan_of_words(words)
 
 
+def figures(words: list[str]) -> int:
+    """``rtgs figures``: panels of pictures from cached runs."""
+    from pipelines.cli.figures import HELP, figures_of_words
+
+    if words[:1] in (["-h"], ["--help"]):
+        print(HELP)
+        return 0
+    return figures_of_words(words)
+
+
 def cache(words: list[str]) -> int:
     """``rtgs cache ls | gc | verify | push | pull``."""
     from pipelines.cli.cache import main as run_cache
@@ -173,7 +219,7 @@ def check(words: list[str]) -> int:
 
     first = words[0] if "=" in words[0] else f"scene.path={words[0]}"
     config, _ = compose(friendly_overrides([first, *words[1:]]))
-    findings = check_source(config.scene, config.sfm)
+    findings = check_source(config.scene, config.sfm, config.masks)
     errors = sum(finding.severity == "error" for finding in findings)
     for finding in findings:
         print(f"{finding.severity}: {finding.message}")
@@ -215,7 +261,8 @@ def report(words: list[str]) -> int:
     parser.add_argument("--root", type=Path, default=_root(), help="folder that holds runs/ (default: %(default)s)")
     parser.add_argument("--open", action="store_true", help="open it in the browser")
     options = parser.parse_args(words)
-    from pipelines.publishing.results import find_run, report_page
+    from pipelines.publishing.results import report_page
+    from rtgs.runs.record import find_run
     from rtgs.workflow import Store
 
     page = report_page(find_run(options.root / "runs", options.run), Store(options.root / "store"))
@@ -243,19 +290,72 @@ def _root() -> Path:
 
 
 def show(words: list[str]) -> int:
-    """``rtgs show``: any splat as pictures, and measured."""
+    """``rtgs show``: a run from anywhere, or any splat as pictures, and measured."""
     from pipelines.cli.show import show as command
 
+    return command(words, _root())
+
+
+def view(words: list[str]) -> int:
+    """``rtgs view``: a run in the browser."""
+    from pipelines.cli.view_run import HELP, view_run
+
+    if words[:1] in (["-h"], ["--help"]):
+        print(HELP)
+        return 0
+    return view_run(words, _root())
+
+
+def get(words: list[str]) -> int:
+    """``rtgs get``: public captures by name."""
+    from pipelines.cli.get import get as command
+
     return command(words)
+
+
+def export(words: list[str]) -> int:
+    """``rtgs export``: a run as files for other programs."""
+    from pipelines.cli.export import export as command
+
+    return command(words, _root())
+
+
+def explain(words: list[str]) -> int:
+    """``rtgs explain``: what a key means, and who set it."""
+    from pipelines.cli.explain import explain as command
+
+    return command(words)
+
+
+def completion(words: list[str]) -> int:
+    """``rtgs completion``: what a shell loads to complete words."""
+    from pipelines.cli.complete import completion as command
+
+    return command(words)
+
+
+def complete(words: list[str]) -> int:
+    """``rtgs complete``: what the shells ask with every Tab."""
+    from pipelines.cli.complete import complete as possible
+
+    print("\n".join(possible(words, list(COMMANDS), _root())))
+    return 0
 
 
 COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "run": run,
     "plan": plan,
+    "figures": figures,
     "cache": cache,
+    "get": get,
     "check": check,
     "show": show,
+    "view": view,
+    "export": export,
     "weights": weights,
     "report": report,
     "dashboard": dashboard,
+    "explain": explain,
+    "completion": completion,
 }
+HIDDEN: dict[str, Callable[[list[str]], int]] = {"complete": complete}

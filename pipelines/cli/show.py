@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from rtgs.scenes.scene import Scene
 
 NEAR = 0.2  # world units, 3DGS
+_NO_SETS = ("mesh", "hull", "object")  # stems of meshes in a run's folder
 NEAR_SHARE = 0.02  # of the orbit's radius or the scene's extent, where that is less: scenes in small units
 
 DESCRIPTION = """Render a Gaussian splat: any .ply of 3DGS, 2DGS, nerfstudio, gsplat or this program (SH degree 0 to 3,
@@ -30,8 +31,29 @@ text or binary), or a compressed .ply of PlayCanvas. Writes frames of an orbit a
 under the mouse. With --scene, also the test views of that capture, and their PSNR and SSIM against the photos."""
 
 
-def show(words: list[str]) -> int:
-    """The command; returns the exit code."""
+def show(words: list[str], root: Path) -> int:
+    """The command: of a file if one is named, else of a run; returns the exit code.
+
+    Args:
+        root: holds ``runs/``.
+    """
+    from pipelines.cli.show_run import HELP, show_run
+
+    if words[:1] in (["-h"], ["--help"]):
+        print(HELP)
+        return 0
+    if any(word.startswith("-") or is_splat(word) for word in words):
+        return show_file(words)
+    return show_run(words, root)
+
+
+def is_splat(word: str) -> bool:
+    """Whether a word names a file of Gaussians."""
+    return word.lower().endswith(".ply") or ("=" not in word and Path(word).is_file())
+
+
+def show_file(words: list[str]) -> int:
+    """``rtgs show FILE.ply``; returns the exit code."""
     options = _parser().parse_intermixed_args(words)
     if options.settings and options.scene is None:
         raise RtgsError(f"{options.settings[0]}: settings of a scene need --scene")
@@ -42,6 +64,8 @@ def show(words: list[str]) -> int:
         raise RtgsError(f"{options.file} holds 0 Gaussians: there is nothing to show; was another file meant?")
     kind = type(gaussians).__name__.lower()
     print(f"{options.file}: {len(gaussians):,} {kind}, SH degree {gaussians.sh_degree}")
+    if note := one_of_several(options.file, gaussians):
+        print(note)
     out = options.out or Path(f"{options.file.name.removesuffix('.ply')}-shown")
     scene = _scene(options) if options.scene is not None else None
     if scene is not None:
@@ -51,10 +75,34 @@ def show(words: list[str]) -> int:
     return 0
 
 
+def one_of_several(file: Path, gaussians: Surfels | Ellipsoids) -> str:
+    """Why pictures of this file alone are not what the method shows, and what to call instead; empty: they are."""
+    from rtgs.gaussians.materials import has_materials
+    from rtgs.runs.record import RUN_FILE
+
+    in_run = (file.parent / RUN_FILE).is_file()
+    sets = sorted(path.name for path in file.parent.glob("*.ply") if path.stem not in _NO_SETS) if in_run else []
+    others = [name for name in sets if name != file.name]
+    if others:
+        return (
+            f"note: this is one of {len(sets)} sets of Gaussians of a method that shades them together; the others are "
+            f"{', '.join(others)}. Alone it lacks what they show, reflections or what lies behind glass, and figures "
+            f"are too low. All layers together: rtgs show {file.parent}"
+        )
+    if has_materials(gaussians):
+        return (
+            "note: these Gaussians have materials of mirrors or glass; what is seen in them is in other sets, which do "
+            "not lie beside this file. All layers together: rtgs show RUN"
+        )
+    return ""
+
+
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser("rtgs show", description=DESCRIPTION)
+    parser = argparse.ArgumentParser("rtgs show", usage="rtgs show FILE.ply [options]", description=DESCRIPTION)
     parser.add_argument("file", type=Path, help="the .ply")
-    parser.add_argument("settings", nargs="*", metavar="scene.key=value", help="settings of the scene, as for rtgs run")
+    parser.add_argument(
+        "settings", nargs="*", default=[], metavar="scene.key=value", help="settings of the scene, as for rtgs run"
+    )
     parser.add_argument("--scene", help="a scene's name or a capture's folder: measure on its test views")
     parser.add_argument("--transform", type=Path, help="nerfstudio's dataparser_transforms.json of the file")
     parser.add_argument("--out", type=Path, help="folder (default: the file's name and -shown)")
@@ -103,7 +151,7 @@ def _measure(gaussians: Surfels | Ellipsoids, scene: Scene, options: argparse.Na
     from rtgs.evaluate.images import to_bytes, write_png
     from rtgs.evaluate.records import RunFacts, write_csv, write_json
 
-    transform = _read_transform(options.transform)
+    transform = read_transform(options.transform)
     near = min(NEAR, NEAR_SHARE * scene.extent)
     renders: list[TimedRender] = []
     stems = unique_stems(view.name for view in scene.test)
@@ -147,7 +195,7 @@ def _turn(gaussians: Surfels | Ellipsoids, scene: Scene | None, options: argpars
         up = torch.tensor(options.up, dtype=torch.float64)
         orbit = orbit_of_gaussians(gaussians, up, picture, options.elevation)
     else:
-        transform = _read_transform(options.transform)
+        transform = read_transform(options.transform)
         cameras = [view.camera for view in (*scene.train, *scene.test)]
         orbit = orbit_of_cameras(cameras if transform is None else [_moved(c, *transform) for c in cameras])
     near = min(NEAR, NEAR_SHARE * orbit.radius)
@@ -179,7 +227,7 @@ def _render(gaussians: Surfels | Ellipsoids, camera: Camera, near: float, option
     )
 
 
-def _read_transform(path: Path | None) -> tuple[Tensor, float] | None:
+def read_transform(path: Path | None) -> tuple[Tensor, float] | None:
     """(3, 4) and scale of nerfstudio's file: a point of the model is scale (R x + t) of one of the capture.
 
     Raises:

@@ -10,10 +10,11 @@ from pipelines.cli.app import RunOutcome, open_tracker, short, tracked_place
 from pipelines.planning.inspection import Inspections
 from pipelines.planning.plan import jobs_of_words
 from pipelines.planning.sweep import Sweep
-from rtgs.config.schema import RunConfig
 from rtgs.config.sweep import ComposedJob
 from rtgs.core.errors import RtgsError
 from rtgs.workflow import StepResult, Store, make_plan
+
+FIGURES = "figures"  # the table of a sweep in the tracker
 
 
 def side_by_side(outcomes: Sequence[RunOutcome]) -> str:
@@ -40,23 +41,33 @@ def write_tables(outcomes: Sequence[RunOutcome], sweep: Sweep | None) -> list[Pa
     from pipelines.publishing.tables import write_experiment_table
 
     paths = write_experiment_table([(outcome.config, outcome.results) for outcome in outcomes])
-    if paths and sweep is not None:
-        _track_table(outcomes[0].config, sweep, paths, any(outcome.news for outcome in outcomes))
+    if outcomes and sweep is not None:
+        _track_tables(outcomes, sweep, paths)
     return paths
 
 
-def _track_table(config: RunConfig, sweep: Sweep, paths: Sequence[Path], news: bool) -> None:
-    """Add the table to the run of the sweep. A sweep without ``news`` whose table is recorded already adds nothing."""
-    from pipelines.publishing.tables import is_table_tracked, note_table_tracked
+def _track_tables(outcomes: Sequence[RunOutcome], sweep: Sweep, paths: Sequence[Path]) -> None:
+    """Add the figures side by side and the experiment's table to the run of the sweep. A sweep of which nothing was
+    recorded now, and whose table is recorded already, adds nothing."""
+    from pipelines.publishing.tables import figures_of, is_table_tracked, note_table_tracked
 
+    config = outcomes[0].config
     tracking = open_tracker(config)
     place = tracked_place(config, tracking)
-    if config.tracking.kind == "off" or (not news and is_table_tracked(paths, place)):
+    if config.tracking.kind == "off":
         return
-    with tracking.sweep(sweep.group(config.tracking.experiment)) as group:
-        for path in paths:
+    info = sweep.group(config.tracking.experiment)
+    news = any(outcome.news for outcome in outcomes)
+    table = bool(paths) and (news or not is_table_tracked(paths, place))
+    recorded = tracking.finished(info.experiment, info.fingerprint) if sweep.elsewhere else news
+    if not table and not recorded:
+        return
+    with tracking.sweep(info) as group:
+        group.table(FIGURES, [figures_of(outcome.config, outcome.results) for outcome in outcomes])
+        for path in paths if table else ():
             group.artifact(path)
-    note_table_tracked(paths, place)
+    if table:
+        note_table_tracked(paths, place)
 
 
 def finished_elsewhere(words: Sequence[str], sweep: Sweep) -> tuple[list[RunOutcome], list[str]]:
@@ -81,9 +92,11 @@ def finished_elsewhere(words: Sequence[str], sweep: Sweep) -> tuple[list[RunOutc
 
 def _left_by(job: ComposedJob, number: int, sweep: Sweep, inspections: Inspections) -> RunOutcome:
     from pipelines.planning.graph import build_graph
+    from pipelines.publishing.run_names import with_own_name
 
     if job.config is None or job.choices is None:
         raise RtgsError(job.problem)
+    config = with_own_name(job.config, job.choices)
     store = Store(job.config.paths.store)
     plan = make_plan(build_graph(job.config, job.choices, inspections).targets, store)
     results = tuple(
@@ -95,4 +108,4 @@ def _left_by(job: ComposedJob, number: int, sweep: Sweep, inspections: Inspectio
         first = next(planned.step for planned in plan if not planned.hit)
         lost = f"did not finish ({first.label} is missing) and left no error: was it killed?"
         raise RtgsError(sweep.error_of(number) or lost)
-    return RunOutcome(job.config, plan, results, job.config.paths.runs / str(job.config.name))
+    return RunOutcome(config, plan, results, config.paths.runs / str(config.name))

@@ -14,6 +14,7 @@ from pipelines.planning.preparation import Preparation, prepare
 from pipelines.planning.transparent import Transparency, find_transparency
 from pipelines.steps import (
     evaluate,
+    external,
     extract_mesh,
     import_scene,
     judge,
@@ -25,13 +26,13 @@ from pipelines.steps import (
     synthesize,
     train,
 )
-from pipelines.steps.training import StageParams
-from rtgs.config.convert import judged
+from rtgs.config.convert import judged, pictures_only
 from rtgs.config.schema import Choices, RunConfig
 from rtgs.core.decisions import Decision
 from rtgs.methods import find_method
 from rtgs.methods.settings import MethodSettings
 from rtgs.pretrained.keys import ABSENT
+from rtgs.runs.training import StageParams
 from rtgs.train.networks import Named
 from rtgs.train.settings import ScheduleSettings
 from rtgs.workflow import Step, StepKind
@@ -46,13 +47,15 @@ KINDS: tuple[StepKind, ...] = (
     extract_mesh.STEP,
     judge.STEP,
     render.STEP,
+    external.STEP,
     evaluate.STEP,
     report.STEP,
     synthesize.STEP,
 )
 """Every kind of step there is; the guard against forgotten version bumps goes through them."""
 
-_NOT_SHOWN = ("paths.", "tracking.", "table.", "name", "threads", "scene.path", "method.paper_schedule.")
+_NOT_SHOWN = ("paths.", "tracking.", "table.", "name", "threads", "view", "scene.path", "method.paper_schedule.")
+_OF_TRAINING = ("method.", "schedule.", "mesh.", "seed", "ablation.")
 
 
 @dataclass(frozen=True)
@@ -94,9 +97,9 @@ def build_graph(config: RunConfig, choices: Choices, inspections: Inspections | 
     networks = tuple(found for found in _pretrained() if found[1] != ABSENT)  # without them the key stays as it was
     training, object_mesh = _training(config, prepared, transparency.present, networks)
     judging = judge_steps(config, choices, prepared, training, networks)
-    rendered = render.STEP.step(render.RenderParams(), scene, *training, *judging)
+    rendered = _rendered(config, scene, *training, *judging)
     measured = evaluate.STEP.step(
-        evaluate.EvaluateParams(config.evaluation, _label(config, choices), choices.preset),
+        evaluate.EvaluateParams(config.evaluation, row_label(config, choices), choices.preset),
         scene,
         *training,
         *(() if object_mesh is None else (object_mesh,)),
@@ -114,6 +117,24 @@ def build_graph(config: RunConfig, choices: Choices, inspections: Inspections | 
     params = _report_params(config, choices, skipped, (*unread, *moved))
     page = report.STEP.step(params, *prepared.steps, scene, *training, *judging, *made)
     return RunGraph(scene, training, rendered, measured, page, mesh, judging, skipped, unread, moved)
+
+
+def _rendered(config: RunConfig, scene: Step, *upstream: Step) -> Step:
+    """The pictures of the test views: rendered, or another program's."""
+    if not pictures_only(config):
+        params = render.RenderParams(True, config.evaluation.supersample, _refine_steps(config))
+        return render.STEP.step(params, scene, *upstream)
+    return external.STEP.step(external.external_params(config.external), scene, name=render.STEP.name)
+
+
+def _refine_steps(config: RunConfig) -> int:
+    """Steps that fit each test pose to its photo; 0: none is fitted."""
+    wanted, spec = config.evaluation.refined_poses, find_method(config.method.name)
+    if wanted == "always":
+        spec.refuse_poses(config.method, "evaluation.refined_poses=always")
+    if wanted == "always" or (wanted == "learned" and config.method.poses.enabled):
+        return config.evaluation.refine_steps
+    return 0
 
 
 def _as_asked(config: RunConfig) -> RunConfig:
@@ -148,10 +169,12 @@ def _training(
     object_mesh = None
     spec = find_method(method.name)
     method = method.in_scene(glass=_through_glass(config, transparent))
+    if spec.elsewhere:
+        return (), None
     for stage in spec.timeline(method, config.schedule, transparent=transparent):
         own = spec.stage(stage.name)
         read = own.reads(method)  # so that runs that differ elsewhere share the stage
-        params = StageParams(read, config.schedule, config.seed, stage.name, stage.from_step, stage.until)
+        params = StageParams(read, config.schedule, config.seed, stage.name, stage.from_step, stage.until, config.watch)
         if own.needs_object:
             drawn = (step for step in prepared.steps if draws_panes(step))
             object_mesh = extract_mesh.STEP.step(extract_mesh.object_params(config), *drawn, scene, *steps)
@@ -199,8 +222,10 @@ def method_label(choices: Choices) -> str:
     return choices.method if choices.ablation in ("", "none") else f"{choices.method}, {choices.ablation}"
 
 
-def _label(config: RunConfig, choices: Choices) -> str:
-    """With what a judge does to it: such rows are not the pure method's."""
+def row_label(config: RunConfig, choices: Choices) -> str:
+    """With what a judge does to it: such rows are not the pure method's. Of other programs' pictures their name."""
+    if pictures_only(config):
+        return config.external.name or method_label(choices)
     return f"{method_label(choices)}, judged" if judged(config) else method_label(choices)
 
 
@@ -209,9 +234,12 @@ def _report_params(
 ) -> report.ReportParams:
     values, defaults = shown_values(config), shown_values(RunConfig())
     lines = {key: (str(values[key]), str(defaults.get(key, ""))) for key in sorted(values)}
-    title = f"{config.scene.name}: {_label(config, choices)}, {choices.preset}"
+    title = f"{config.scene.name}: {row_label(config, choices)}, {choices.preset}"
     decisions = [(f"no {step.what} step", step.why) for step in skipped]
     decisions += [(each.what, each.why) for each in noted]
+    if pictures_only(config):
+        why = f"pictures of another program, from {config.external.renders}: nothing is trained"
+        decisions.append(("external", why))
     return report.ReportParams(title, command(choices), lines, tuple(decisions))
 
 
@@ -219,6 +247,8 @@ def shown_values(config: RunConfig) -> dict[str, object]:
     """Every value that has to do with the result, by dotted key."""
     meshed = config.mesh.extract or find_method(config.method.name).object_stage(config.method) is not None
     hidden = _NOT_SHOWN if meshed else (*_NOT_SHOWN, "mesh.")
+    hidden = (*hidden, *_OF_TRAINING) if pictures_only(config) else (*hidden, "external.")
+    hidden = hidden if config.watch.on else (*hidden, "watch.")
     if not config.judge.plain and not config.scene.hold_out:  # pages of runs without a judge stay as they were
         hidden = (*hidden, "judge.", "scene.hold_out")
     return {key: value for key, value in flatten(asdict(config)).items() if not key.startswith(hidden)}

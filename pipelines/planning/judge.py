@@ -6,13 +6,13 @@ from dataclasses import replace
 
 from pipelines.planning.preparation import Preparation
 from pipelines.steps import judge, train
-from pipelines.steps.training import StageParams
 from rtgs.config.compose import compose_plain
 from rtgs.config.convert import judged
 from rtgs.config.schema import Choices, RunConfig
 from rtgs.core.decisions import Decision
 from rtgs.core.errors import RtgsError
 from rtgs.methods import find_method
+from rtgs.runs.training import StageParams
 from rtgs.train.networks import Named
 from rtgs.train.settings import ScheduleSettings
 from rtgs.workflow import Step

@@ -14,6 +14,8 @@ from rtgs.prepare.errors import PrepareError
 from rtgs.prepare.source import Source
 from rtgs.workflow import Step
 
+_DRAWN = ("polygon", "grabcut", "drawn")  # ways that read a file of marks
+
 
 class MaskPlan(NamedTuple):
     """The way masks are made, or why they are not."""
@@ -39,6 +41,8 @@ def plan_masks(config: RunConfig, inspection: Inspection) -> MaskPlan:
         if settings.source == "grounded_sam2":
             find_networks(settings)
         _refuse_early_forms(config, inspection.source)
+        if settings.source in _DRAWN:
+            _refuse_bad_marks(config, inspection)
         return MaskPlan(settings.source, "")
     return _automatic(config, inspection)
 
@@ -53,6 +57,7 @@ def _automatic(config: RunConfig, inspection: Inspection) -> MaskPlan:
     marks = inspection.folder / config.masks.drawn.file
     if marks.is_file():
         kinds = drawn_kinds(marks)
+        _refuse_bad_marks(config, inspection)
         return MaskPlan("polygon" if kinds == ("panes",) else "grabcut" if kinds == ("cutouts",) else "drawn", "")
     if not _reads_masks(config):
         return MaskPlan(
@@ -64,6 +69,18 @@ def _automatic(config: RunConfig, inspection: Inspection) -> MaskPlan:
         hint = f"; `rtgs weights status` says where to get it, {marks.name} beside the photos does without"
         return MaskPlan("", f"{error}".split("; searched")[0] + hint)
     return MaskPlan("grounded_sam2", "")
+
+
+def _refuse_bad_marks(config: RunConfig, inspection: Inspection) -> None:
+    """Marks that the step would refuse: now, not when poses have been looked for.
+
+    Raises:
+        PrepareError: the file is not there, not of its form, or names photos that there are not.
+    """
+    from rtgs.prepare.masks.drawn import read_drawing
+    from rtgs.prepare.source import mark_file, markable_names
+
+    read_drawing(mark_file(inspection.source, config.masks), markable_names(inspection.source, config.scene))
 
 
 def _no_glass(source: Source) -> str:

@@ -12,8 +12,10 @@ from typing import Any, Protocol, runtime_checkable
 from hydra.types import TaskFunction
 from omegaconf import DictConfig
 
+from pipelines.planning.graph import KINDS
 from pipelines.planning.plan import Job, describe, merge_jobs, remote_store
 from rtgs.config.schema import RunConfig
+from rtgs.core.credentials import redact
 from rtgs.core.errors import RtgsError
 from rtgs.track import RunInfo
 from rtgs.track.source import git_tags
@@ -21,6 +23,7 @@ from rtgs.workflow import RemoteStore, Step, Store, SweepOutcomes, make_plan, to
 from rtgs.workflow.engine import DaskExecutor, EngineSettings, WorkerJob, open_client
 
 log = logging.getLogger("rtgs")
+_STARTED = ".started"  # in a sweep's folder: as old as the sweep
 _HERE = ("BasicLauncher", "RtgsDaskLauncher")  # run jobs in the process that starts the sweep
 
 
@@ -44,16 +47,24 @@ class Sweep:
 
     def group(self, experiment: str) -> RunInfo:
         """The run that holds the jobs together in the tracker."""
-        return RunInfo(experiment, self.name, f"sweep {self.id}", {"rtgs.sweep": self.id, **git_tags()})
+        tags = {"rtgs.sweep": self.id, **git_tags()}
+        return RunInfo(experiment, self.name, f"sweep {self.id}", tags, seconds_before=self._seconds())
 
-    def forget_errors(self) -> None:
-        """Before any job: remove the errors of another sweep that was given this folder."""
+    def _seconds(self) -> float:
+        """Since it began; 0 where nobody noted when."""
+        noted = self.folder / _STARTED
+        return max(0.0, time.time() - noted.stat().st_mtime) if noted.is_file() else 0.0
+
+    def begin(self) -> None:
+        """Before any job: note the time, and remove the errors of another sweep that was given this folder."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        (self.folder / _STARTED).write_text(f"{self.id}\n", encoding="utf-8")
         for left in self.folder.glob("error_*.txt"):
             left.unlink(missing_ok=True)
 
     def leave_error(self, number: int, error: Exception) -> None:
         """In a job: what stopped it. Launchers with processes of their own bring only the first error back."""
-        self._error_file(number).write_text(f"{error}\n", encoding="utf-8")
+        self._error_file(number).write_text(redact(f"{error}\n"), encoding="utf-8")
 
     def error_of(self, number: int) -> str:
         """What stopped a job; empty where it left no error."""
@@ -96,8 +107,9 @@ def run_merged(jobs: Sequence[Job], settings: EngineSettings) -> SweepOutcomes:
     log.info("%d jobs, %s", len(jobs), describe(plan))
     if plan.complete:
         return SweepOutcomes({})
+    settings.needs.check(kind.name for kind in KINDS)
     with open_client(settings) as client:
-        outcomes = DaskExecutor(client, _worker_job(config, settings)).attempt(plan)
+        outcomes = DaskExecutor(client, _worker_job(config, settings), settings.room()).attempt(plan)
     check_arrived(merged.targets, outcomes, store, remote_store(config))
     return replace(outcomes, planned={planned.step.fingerprint: planned for planned in plan})
 
@@ -142,4 +154,5 @@ def _worker_job(config: RunConfig, settings: EngineSettings) -> WorkerJob:
         tracking.kind,
         str(Path(config.paths.root)),
         tracking.uri,
+        dict(settings.needs.threads),
     )

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from pipelines.publishing.results import final_training
 from pipelines.steps.training import read_summary
 from rtgs.config.compose import compose
+from rtgs.config.convert import pictures_only
 from rtgs.config.locate import choices_of, conf_dir
 from rtgs.config.schema import RunConfig
 from rtgs.core.documents import load_yaml
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 PRINTED = {"rtgs": "rtgs_printed"}  # the method that is another one's paper; the others are their own with preset=paper
 # Where results go, what is measured, and where this machine has its files: no part of a method.
 _OUTSIDE = (
-    *("paths.", "tracking.", "table.", "evaluation.", "ablation.", "name", "threads", "method.name"),
+    *("paths.", "tracking.", "table.", "evaluation.", "ablation.", "name", "threads", "view", "method.name"),
     *(
         "schedule.checkpoint_every",
         "schedule.evaluate_every",
@@ -31,9 +32,12 @@ _OUTSIDE = (
         "scene.name",
         "scene.path",
         "scene.format",
+        "external.",
+        "watch.",
         "normals.file",
     ),
 )
+_ELSEWHERE = "its pictures are another program's: how that was trained is not known here"
 _WEIGHT = "its weight is 0"  # how rtgs.train.terms explains a loss that a method does not have
 
 
@@ -42,6 +46,8 @@ def ways_of(config: RunConfig, row: str, results: Sequence[StepResult]) -> tuple
 
     ``row`` of a table: ``method`` or ``method, ablation``; an ablation of the paper is compared with the paper's.
     """
+    if pictures_only(config):
+        return (_ELSEWHERE,)
     decisions = read_summary(final_training(results)).decisions
     told = (str(each) for each in decisions if not each.why.startswith(_WEIGHT))  # a weight is a key of the config
     return (*keys_of(config, row), *told)

@@ -14,27 +14,31 @@ from tempfile import TemporaryDirectory
 from filelock import FileLock
 
 from pipelines.planning.rows import plan_rows
-from pipelines.publishing.run_record import RUN_FILE, RunRecord
 from pipelines.steps.evaluate import TABLE_CSV, TABLE_JSON
-from pipelines.steps.judge import PLAIN
 from pipelines.steps.judge import STEP as JUDGE
 from pipelines.steps.pictures import final_pictures, training_pictures
+from pipelines.steps.render import ENVIRONMENT, PREVIEW
 from pipelines.steps.report import PAGE
 from pipelines.steps.report import STEP as REPORT
-from pipelines.steps.training import read_history, stage_params
 from rtgs.config.schema import Choices, RunConfig
+from rtgs.core.credentials import redact
 from rtgs.core.errors import RtgsError
 from rtgs.core.listing import columns
 from rtgs.evaluate.judgement import RECORD_FILE, JudgeRecord
 from rtgs.evaluate.records import EvaluationTable, read_json
 from rtgs.prepare.masks.report import FILES as MASK_FILES
 from rtgs.prepare.poses.quality import PICTURE_FILE, REPORT_FILE
+from rtgs.report.files import link_files
+from rtgs.runs.mixture import PLAIN
+from rtgs.runs.record import RUN_FILE, RunRecord
+from rtgs.runs.training import has_training, last_training, read_history, stage_params
 from rtgs.track import RunInfo, Tracker
 from rtgs.track.source import git_tags, installed
 from rtgs.workflow import Artifacts, Plan, Step, StepResult, Store
 
 CONFIG_FILE = "config.yaml"
 INSTALLED_FILE = "requirements.txt"
+SHOWN = "shown"  # what `rtgs show` made of this model
 _TRACKED_IMAGES = 4
 log = logging.getLogger("rtgs")
 _NOT_TOLD = ("paths.", "tracking.", "table.")  # where results go, not what they are
@@ -60,9 +64,10 @@ def is_tracked(config: RunConfig, plan: Plan, place: str) -> bool:
 def write_run_folder(config: RunConfig, choices: Choices, command: str, results: Sequence[StepResult]) -> Path:
     """Copy what people look at into ``runs/<name>``; nothing is copied when it is all there already.
 
-    ``report.html``, ``metrics.json``, ``metrics.csv``, ``renders/``, ``errors/``, ``point_cloud.ply`` (the base set;
+    ``report.html``, ``preview.webp`` (where the capture has a path), ``metrics.json``, ``metrics.csv``, ``renders/``,
+    ``errors/``, ``point_cloud.ply`` (the base set;
     other sets under their own names; the plain method's where a judge kept it everywhere), ``mesh.ply`` when asked for,
-    ``judge.json`` of a run with a judge, ``config.yaml``, ``run.json``.
+    ``environment/`` of a method with a far light, ``judge.json`` of a run with a judge, ``config.yaml``, ``run.json``.
     """
     folder = config.paths.runs / str(config.name)
     config.paths.runs.mkdir(parents=True, exist_ok=True)
@@ -89,20 +94,27 @@ def _fill_run_folder(
     known = _known(folder)
     if known is not None and known.steps == steps and (folder / PAGE).is_file():
         return folder
+    if known is not None and known.steps != steps:
+        log.info("%s", replaced(folder, known, command))
     folder.mkdir(parents=True, exist_ok=True)
     (folder / RUN_FILE).unlink(missing_ok=True)  # written last: a folder without it is incomplete
-    for pattern in ("*.ply", "mesh.*", RECORD_FILE):  # of another run of this name, with other stages
+    for pattern in ("*.ply", "mesh.*", RECORD_FILE, PREVIEW):  # of another run of this name, with other stages
         for left in folder.glob(pattern):
             left.unlink(missing_ok=True)
+    shutil.rmtree(folder / SHOWN, ignore_errors=True)
     places = folders(results)
     shutil.copyfile(places["report"] / PAGE, folder / PAGE)
     for name in (TABLE_JSON, TABLE_CSV):
         shutil.copyfile(places["evaluate"] / name, folder / name)
     _replace_tree(places["render"] / "images", folder / "renders")
+    if (places["render"] / PREVIEW).is_file():
+        shutil.copyfile(places["render"] / PREVIEW, folder / PREVIEW)
     _replace_tree(places["evaluate"] / "errors", folder / "errors")
+    _replace_tree(places["render"] / ENVIRONMENT, folder / ENVIRONMENT)
     if JUDGE.name in places:
         shutil.copyfile(places[JUDGE.name] / RECORD_FILE, folder / RECORD_FILE)
-    for ply in sorted(shown_training(results).glob("*.ply")):
+    shown = shown_training(results)
+    for ply in sorted(shown.glob("*.ply")) if shown is not None else ():
         shutil.copyfile(ply, folder / ("point_cloud.ply" if ply.stem == "base" else ply.name))
     for mesh in sorted(places["extract_mesh"].glob("mesh.*")) if "extract_mesh" in places else ():
         shutil.copyfile(mesh, folder / mesh.name)
@@ -111,9 +123,20 @@ def _fill_run_folder(
     for name in MASK_FILES if "masks" in places else ():
         shutil.copyfile(places["masks"] / name, folder / name)
     (folder / CONFIG_FILE).write_text(config_yaml(config), encoding="utf-8")
+    link_files(folder / PAGE)
     finished = datetime.now(UTC).isoformat(timespec="seconds")
     RunRecord(str(config.name), command, finished, asdict(choices), steps).write(folder)
     return folder
+
+
+def replaced(folder: Path, before: RunRecord, command: str) -> str:
+    """In words: a run folder now shows another run of its name, or the same one with other results."""
+    if before.command == command:
+        return f"{folder}: the results of {before.finished} are replaced; they stay in the store (rtgs cache ls)"
+    return (
+        f"{folder} showed another run and now shows this one; name=... keeps both. `{before.command}` brings the other "
+        "back from the store"
+    )
 
 
 def _known(folder: Path) -> RunRecord | None:
@@ -137,10 +160,18 @@ def folders(results: Sequence[StepResult]) -> dict[str, Path]:
     return {result.step.name: result.folder for result in results}
 
 
+def was_trained(results: Sequence[StepResult]) -> bool:
+    """Whether the run trained anything; else the pictures are another program's."""
+    return has_training(folders(results))
+
+
 def final_training(results: Sequence[StepResult]) -> Path:
-    """The artifact of the last training stage."""
-    trained = [result.folder for result in results if result.step.name.startswith("train_")]
-    return max(trained, key=lambda folder: stage_params(folder).until)
+    """The artifact of the last training stage.
+
+    Raises:
+        RtgsError: the run trained nothing.
+    """
+    return last_training(folders(results))
 
 
 def judge_record(results: Sequence[StepResult]) -> JudgeRecord | None:
@@ -149,18 +180,21 @@ def judge_record(results: Sequence[StepResult]) -> JudgeRecord | None:
     return JudgeRecord.read(places[JUDGE.name]) if JUDGE.name in places else None
 
 
-def shown_training(results: Sequence[StepResult]) -> Path:
-    """The artifact whose sets of Gaussians are published: of the run's method, unless nothing of it is shown."""
+def shown_training(results: Sequence[StepResult]) -> Path | None:
+    """The artifact whose sets of Gaussians are published: of the run's method, unless nothing of it is shown. None:
+    the run trained nothing."""
+    if not was_trained(results):
+        return None
     record = judge_record(results)
     return folders(results)[PLAIN] if record is not None and record.all_plain else final_training(results)
 
 
 def config_yaml(config: RunConfig) -> str:
-    """The resolved config as YAML."""
+    """The resolved config as YAML, credentials left out."""
     from omegaconf import OmegaConf
 
     values = asdict(config)
-    return OmegaConf.to_yaml(OmegaConf.create(json.loads(json.dumps(values))))
+    return redact(OmegaConf.to_yaml(OmegaConf.create(json.loads(json.dumps(values)))))
 
 
 def evaluation_of(results: Sequence[StepResult]) -> EvaluationTable:
@@ -169,13 +203,24 @@ def evaluation_of(results: Sequence[StepResult]) -> EvaluationTable:
 
 
 def result_table(tables: Sequence[EvaluationTable], seeds: Sequence[int] = ()) -> str:
-    """Runs side by side in plain text; what was not measured is ``n/a``. ``seeds``: shown where they differ."""
+    """Runs side by side in plain text; what was not measured is ``n/a``. ``seeds``: shown where they differ.
+
+    Beside the PSNR of whole pictures, where known: that of the pixels that enough training views show, and the noise
+    floor of the test photos.
+    """
     from rtgs.evaluate.tables import summarize
 
     seeded = len(set(seeds)) > 1
-    header = ("scene", "method", "preset", *(["seed"] if seeded else []), "views", "PSNR", "SSIM", "LPIPS", "FLIP")
+    summaries = summarize(tables)
+    beside = [
+        (title, name)
+        for title, name in (("seen", "psnr_framed"), ("noise floor", "noise_psnr"))
+        if any(getattr(row, name) is not None for row in summaries)
+    ]
+    header = ("scene", "method", "preset", *(["seed"] if seeded else []), "views", "PSNR")
+    header = (*header, *(title for title, _ in beside), "SSIM", "LPIPS", "FLIP")
     rows: list[tuple[str, ...]] = [(*header, "train", "memory", "surfels")]
-    for index, row in enumerate(summarize(tables)):
+    for index, row in enumerate(summaries):
         rows.append(
             (
                 row.scene,
@@ -184,6 +229,7 @@ def result_table(tables: Sequence[EvaluationTable], seeds: Sequence[int] = ()) -
                 *([str(seeds[index])] if seeded else []),
                 f"{row.views} of {row.resolution}" if row.views else "none",
                 _figure(row.psnr, "{:.2f} dB"),
+                *(_figure(getattr(row, name), "{:.2f} dB") for _, name in beside),
                 _figure(row.ssim, "{:.4f}"),
                 _figure(row.lpips_01, "{:.4f}"),
                 _figure(row.flip, "{:.4f}"),
@@ -253,7 +299,8 @@ def track_end(tracker: Tracker, folder: Path, results: Sequence[StepResult], art
     tracker.metrics({f"cost/{name}": value for name, value in facts.items() if value is not None})
     if table.object is not None:
         tracker.metrics({f"object/{name}": value for name, value in table.object.numbers().items()})
-    tracker.metrics({"surfels": float(table.facts.surfels or 0)})
+    if table.facts.surfels is not None:
+        tracker.metrics({"surfels": float(table.facts.surfels)})
     tracker.table("eval", [{"view": row.view, **row.values} for row in table.rows])
     _track_sliders(tracker, results, artifacts)
     for path in sorted((folder / "renders").glob("*.png"))[:_TRACKED_IMAGES]:
@@ -269,8 +316,9 @@ def _track_sliders(tracker: Tracker, results: Sequence[StepResult], artifacts: A
     """Fixed views and layers at several steps, the last of them as the test views were rendered."""
     from rtgs.scenes.canonical import read_scene
 
-    places = folders(results)
-    last = final_training(results)
+    if not was_trained(results):
+        return
+    places, last = folders(results), final_training(results)
     for result in results:
         if result.step.name.startswith("train_"):
             for picture in training_pictures(result.folder):
@@ -299,26 +347,10 @@ def report_page(folder: Path, store: Store) -> Path:
         return page
     record = RunRecord.read(folder)
     key = record.steps.get("report", "") if record else ""
-    cached = store.root / "report" / key[:2] / key / PAGE
+    cached = store.folder_of("report", key) / PAGE
     if not cached.is_file():
         repeat = record.command if record else "rtgs run ..."
         raise RtgsError(f"{page} is gone and not in the store either; `{repeat}` makes it again")
     shutil.copyfile(cached, page)
+    link_files(page)
     return page
-
-
-def find_run(runs: Path, name: str | None) -> Path:
-    """The folder of the named run, or of the one that finished last.
-
-    Raises:
-        RtgsError: there is none, or its record is damaged.
-    """
-    if name is None:
-        found = {folder.name: record for folder in sorted(runs.glob("*")) if (record := RunRecord.read(folder))}
-        if not found:
-            raise RtgsError(f"no finished run in {runs}; start one with `rtgs run`")
-        return runs / max(found, key=lambda each: found[each].finished)
-    if RunRecord.read(runs / name) is None:
-        listed = ", ".join(path.parent.name for path in sorted(runs.glob(f"*/{RUN_FILE}"))) or "none"
-        raise RtgsError(f"no finished run {name!r} in {runs}; there is {listed}")
-    return runs / name

@@ -9,19 +9,22 @@ from contextlib import suppress
 from pathlib import Path
 
 from pipelines.publishing.against_paper import ways_of
-from pipelines.publishing.results import evaluation_of
+from pipelines.publishing.results import evaluation_of, folders, was_trained
 from rtgs.config.schema import RunConfig
 from rtgs.core.documents import load_json
 from rtgs.evaluate.publish import PAPER_DATA, Measured, TableSpec, build_table
 from rtgs.evaluate.table_formats import write_table
+from rtgs.track.protocol import Scalar
 from rtgs.workflow import StepResult
 from rtgs.workflow.fingerprint import file_digest
 
+_FIGURES = (("PSNR", "psnr"), ("SSIM", "ssim"), ("LPIPS", "lpips_01"), ("FLIP", "flip"))
 _TRACKED_FILE = ".tracked.json"  # beside a table: digests of its files by the tracker that has them
 
 
 def write_experiment_table(runs: Sequence[tuple[RunConfig, Sequence[StepResult]]]) -> list[Path]:
-    """Write ``<root>/tables/<name>-<preset>/table.{md,csv,tex,html}``; nothing where no table is asked for.
+    """Write ``<root>/tables/<name>-<preset>/table.{md,csv,tex,html}``; nothing where no table is asked for. Of quality
+    over training time what :func:`pipelines.publishing.time_quality.write_time_quality` writes, for all presets.
 
     On the papers' data the folder ends in ``-papers_data``: it does not replace the table of the stand-ins.
 
@@ -32,9 +35,13 @@ def write_experiment_table(runs: Sequence[tuple[RunConfig, Sequence[StepResult]]
     if not asked:
         return []
     config = asked[0][0]
+    if config.table.kind == "time_quality":
+        from pipelines.publishing.time_quality import write_time_quality
+
+        return write_time_quality(config.paths.tables / config.table.name, asked)
     names = config.table.paper_scenes
     measured = []
-    for one, results in asked:
+    for one, results in _without_echoes(asked):
         evaluation = evaluation_of(results)
         scene = one.scene.name  # not the table's name of it, which says what is a stand-in
         differs = ways_of(one, evaluation.facts.method, results) if config.table.data == PAPER_DATA else ()
@@ -45,11 +52,39 @@ def write_experiment_table(runs: Sequence[tuple[RunConfig, Sequence[StepResult]]
     return list(write_table(config.paths.tables / folder, build_table(spec, measured)))
 
 
+def _without_echoes(
+    runs: Sequence[tuple[RunConfig, Sequence[StepResult]]],
+) -> list[tuple[RunConfig, Sequence[StepResult]]]:
+    """Runs, pictures of other programs once: under another seed the same pictures would be a spread of 0."""
+    seen: set[Path] = set()
+    kept = []
+    for config, results in runs:
+        place = folders(results)["evaluate"]
+        if was_trained(results) or place not in seen:
+            kept.append((config, results))
+        seen.add(place)
+    return kept
+
+
 def _mesh_seconds(results: Sequence[StepResult]) -> float:
     """Of the mesh that a stage of the training waited for; 0: none did."""
     trained = [result.step for result in results if result.step.name.startswith("train_")]
     awaited = {step.fingerprint for each in trained for step in each.upstream if step.name == "extract_mesh"}
     return sum(result.duration for result in results if result.step.fingerprint in awaited)
+
+
+def figures_of(config: RunConfig, results: Sequence[StepResult]) -> dict[str, Scalar]:
+    """What a run is and what it reached, means over the test views; None: not measured."""
+    table = evaluation_of(results)
+    facts = table.facts
+    told = {"scene": facts.scene, "method": facts.method, "preset": facts.preset, "seed": config.seed}
+    return {
+        **told,
+        **{shown: table.mean(name) for shown, name in _FIGURES},
+        "train_seconds": facts.train_seconds,
+        "surfels": facts.surfels,
+        "run": str(config.name),
+    }
 
 
 def is_table_tracked(paths: Sequence[Path], place: str) -> bool:

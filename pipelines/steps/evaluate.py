@@ -10,14 +10,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.steps.judge import PLAIN
 from pipelines.steps.judge import STEP as JUDGE
 from pipelines.steps.render import RenderTimes, read_timed
-from pipelines.steps.training import last_training, read_summary
+from pipelines.steps.training import read_summary
 from rtgs.evaluate.judgement import JudgeRecord
 from rtgs.evaluate.networks import check_networks
 from rtgs.evaluate.settings import EvaluationSettings
 from rtgs.mesh.record import MeshRecord
+from rtgs.runs.mixture import PLAIN
+from rtgs.runs.training import has_training, last_training
 from rtgs.workflow import StepContext, StepKind
 
 if TYPE_CHECKING:
@@ -28,7 +29,17 @@ if TYPE_CHECKING:
 TABLE_JSON = "metrics.json"
 TABLE_CSV = "metrics.csv"
 TRACKED = (  # means over the test views that go to the tracker, where they are measured
-    *("psnr", "ssim", "lpips_01", "psnr_masked", "ssim_masked", "lpips_01_masked", "psnr_specular"),
+    *(
+        "psnr",
+        "cc_psnr",
+        "psnr_refined_poses",
+        "ssim",
+        "lpips_01",
+        "psnr_masked",
+        "ssim_masked",
+        "lpips_01_masked",
+        "psnr_specular",
+    ),
     *("flip", "flip_masked"),
     *("psnr_reflection", "psnr_reflection_scaled", "psnr_transmission", "psnr_transmission_scaled"),
     *("psnr_given_masks", "psnr_masked_given_masks", "ssim_masked_given_masks"),
@@ -63,15 +74,21 @@ def evaluate(params: EvaluateParams, context: StepContext) -> None:
         context.log.warning("nothing is measured: %s", NO_TEST_VIEWS)
     summary = _summary(context.inputs)
     facts = RunFacts(
-        scene=scene.name,
-        method=params.method,
-        preset=params.preset,
-        steps=summary.steps,
-        surfels=summary.surfels,
-        train_seconds=summary.seconds,
-        train_cpu_seconds=summary.cpu_seconds,
-        peak_memory_mb=summary.peak_memory_mb,
+        scene.name,
+        params.method,
+        params.preset,
+        supersample=params.evaluation.supersample,
+        noise_psnr=scene.noise_psnr,
     )
+    if summary is not None:
+        facts = replace(
+            facts,
+            steps=summary.steps,
+            surfels=summary.surfels,
+            train_seconds=summary.seconds,
+            train_cpu_seconds=summary.cpu_seconds,
+            peak_memory_mb=summary.peak_memory_mb,
+        )
     rendered = context.inputs["render"]
     times = RenderTimes.read(rendered)
     renders = [read_timed(rendered, times, view.name, view.camera) for view in scene.test]
@@ -90,8 +107,11 @@ def evaluate(params: EvaluateParams, context: StepContext) -> None:
         context.tracker.metrics({f"object/{name}": value for name, value in known.numbers().items()})
 
 
-def _summary(inputs: Mapping[str, Path]) -> TrainSummary:
-    """Of the training; where a judge was asked, with what the plain method cost, and the surfels of what is shown."""
+def _summary(inputs: Mapping[str, Path]) -> TrainSummary | None:
+    """Of the training; where a judge was asked, with what the plain method cost, and the surfels of what is shown.
+    None: the pictures are another program's."""
+    if not has_training(inputs):
+        return None
     full = read_summary(last_training(inputs))
     if JUDGE.name not in inputs:
         return full
@@ -142,4 +162,4 @@ def _judged(share: float) -> float | None:
     return None if math.isnan(share) else share
 
 
-STEP = StepKind("evaluate", 7, evaluate)
+STEP = StepKind("evaluate", 8, evaluate)

@@ -8,11 +8,11 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipelines.steps.training import last_training, load_method
 from rtgs.core.decisions import Decision
 from rtgs.core.errors import RtgsError
 from rtgs.mesh.record import MeshRecord, MeshTruth
 from rtgs.mesh.settings import ObjectSettings, TsdfSettings
+from rtgs.runs.training import last_training, load_method
 from rtgs.workflow import StepContext, StepKind
 
 if TYPE_CHECKING:
@@ -260,7 +260,7 @@ def _depth_views(method: Method, step: int, scene: Scene, params: ExtractMeshPar
         assert buffers.depth is not None
         depth = surface_depth(buffers.depth, buffers.alpha, buffers.median_depth, params.depth_ratio)
         mask = view.mask if params.only_masked else None
-        yield DepthView(view.camera, depth, rendered.image, buffers.alpha, mask)
+        yield DepthView(rendered.camera, depth, rendered.image, buffers.alpha, mask)
 
 
 def _pictured(mesh: TriangleMesh, scene: Scene, params: ExtractMeshParams, out: Path) -> str:

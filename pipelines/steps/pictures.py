@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipelines.steps.views import read_render, view_maps
 from rtgs.core.names import unique_stems
+from rtgs.runs.views import read_render, view_maps
 
 if TYPE_CHECKING:
     import numpy as np
@@ -54,7 +54,7 @@ def fixed_views(scene: Scene) -> tuple[View, ...]:
 
 
 def layer_pixels(maps: Mapping[str, Tensor], camera: Camera) -> dict[str, np.ndarray]:
-    """The layers people look at, as pixels; ``maps`` as :func:`pipelines.steps.views.view_maps` gives them."""
+    """The layers people look at, as pixels; ``maps`` as :func:`rtgs.runs.views.view_maps` gives them."""
     from rtgs.evaluate.images import to_bytes
     from rtgs.report.figures import alpha_picture, normal_picture
 

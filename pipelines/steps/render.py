@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipelines.steps.judge import read_mixture
-from pipelines.steps.training import last_training, load_method
-from pipelines.steps.views import COVERAGE, read_coverage, read_render, view_maps
 from rtgs.core.errors import RtgsError
+from rtgs.core.recipe import UNLESS_DEFAULT
 from rtgs.core.records import read_record, write_json
+from rtgs.runs.mixture import Mixture, read_mixture
+from rtgs.runs.training import last_training, load_method
+from rtgs.runs.views import COVERAGE, read_coverage, read_render, view_maps
 from rtgs.workflow import StepContext, StepKind
 
 if TYPE_CHECKING:
@@ -21,12 +22,23 @@ if TYPE_CHECKING:
 
     from rtgs.core.cameras import Camera
     from rtgs.evaluate.evaluate import TimedRender
+    from rtgs.methods import RenderOptions
     from rtgs.methods.model import Model
+    from rtgs.runs.mixture import Mixture
     from rtgs.scenes.scene import Scene, View
 
 TIMES_FILE = "render.json"
 GIVEN = "image_given_masks"  # of methods with a third stage: seen through the view's own mask, not the silhouette
 
+REFINED = "image_refined_pose"  # from the pose that was fitted to the view's photo
+PREVIEW = "preview.webp"
+PREVIEW_SIDE = 256  # pixels
+WARM_UP = "warm-up"  # name of the camera of a picture that is rendered before any time is taken
+_WARM = 16  # its pixels a side
+PREVIEW_RATE = 8  # frames a second
+PREVIEW_BYTES = 400_000
+ENVIRONMENT = "environment"  # folder of pictures of the far light, of methods that have one
+_ENVIRONMENT_SIDE = 128  # of its cubemap; the panorama is 512 x 256
 FULL = "image_full"  # where the judge kept the plain method: of the full method alone
 
 
@@ -35,15 +47,15 @@ class RenderTimes:
     """``render.json``: how long the test views took.
 
     Attributes:
-        seconds: by the wall, by view name.
+        seconds: by the wall, by view name; None: another program rendered the view, and nobody took its time.
         with_maps: the time is that of the image together with its maps; False: of the image alone.
     """
 
-    seconds: dict[str, float]
+    seconds: dict[str, float | None]
     with_maps: bool = False  # artifacts of older versions do not say
 
-    def of(self, view_name: str) -> float:
-        """Seconds of one view.
+    def of(self, view_name: str) -> float | None:
+        """Seconds of one view; None: not known.
 
         Raises:
             RtgsError: the view was not rendered.
@@ -74,6 +86,12 @@ class RenderParams:
 
     maps: bool = True
     """Also depth, normal and alpha."""
+    supersample: int = field(default=1, metadata=UNLESS_DEFAULT)
+    """Images, not maps, are rendered so many times finer and averaged."""
+    refine_steps: int = field(default=0, metadata=UNLESS_DEFAULT)
+    """Steps in which each view's pose is fitted to its photo for one image more; 0: there is none."""
+    preview: int = 24
+    """Frames of the looping preview; 0: none."""
 
 
 def render(params: RenderParams, context: StepContext) -> None:
@@ -82,14 +100,18 @@ def render(params: RenderParams, context: StepContext) -> None:
     Writes ``images/<stem>.png`` (8 bit, stems of ``unique_stems``), ``views/<stem>.safetensors`` (float32: image (3,
     H, W) not clamped, depth (H, W) z-depth divided by alpha in world units, normal (3, H, W) world frame where the
     method has one, alpha (H, W); with a third stage also ``image_given_masks``; where a judge kept the plain method
-    ``image_full``, the full one's image: maps and layers are the full method's), ``coverage.safetensors`` (by view name
-    (H, W) int16: training views that show what the pixel shows) and ``render.json`` (:class:`RenderTimes`).
+    ``image_full``, the full one's image: maps and layers are the full method's; with ``refine_steps`` also
+    ``image_refined_pose``), ``coverage.safetensors`` (by view name (H, W) int16: training views that show what the
+    pixel shows), ``preview.webp`` (a way round the scene that plays for ever, small) and ``render.json``
+    (:class:`RenderTimes`). ``params.supersample`` is of the other images. Of methods with a far light also
+    ``environment/`` (:func:`rtgs.light.pictures.save_environment`; up is that of the cameras).
     """
     import torch
     from safetensors.torch import save_file
 
     from rtgs.core.names import unique_stems
     from rtgs.evaluate.images import to_bytes, write_png
+    from rtgs.light.pictures import mean_frame, save_environment
     from rtgs.methods import Mode, RenderOptions
     from rtgs.scenes.canonical import read_scene
 
@@ -99,34 +121,116 @@ def render(params: RenderParams, context: StepContext) -> None:
     options = RenderOptions()
     if params.maps:  # they change no bit of the image
         options = RenderOptions(depth=True, normal="normal" in method.maps, layers=True)
+    finer = _Finer(method, mixture, stage.until, params.supersample)
     seconds: dict[str, float] = {}
     (context.out / "views").mkdir()
     surfaces: dict[str, Tensor] = {}
     stems = unique_stems(view.name for view in scene.test)
+    for view in scene.test[:1]:  # what is loaded and made once is no view's time
+        with torch.no_grad():
+            small = replace(view.camera.resized(_WARM, _WARM), name=WARM_UP)
+            method.render(small, stage.until, Mode.EVALUATE, options, None)
     for view in scene.test:
         stem = stems[view.name]
         with torch.no_grad():
             start = time.perf_counter()
             rendered = method.render(view.camera, stage.until, Mode.EVALUATE, options, view.mask)
-            image = rendered.image if mixture is None else mixture.of(view.camera, rendered.image)
+            full = rendered.image if params.supersample == 1 else finer.full(view, RenderOptions())
+            image = full
+            if mixture is not None:
+                image = finer.mixed(view, full, RenderOptions())
             seconds[view.name] = time.perf_counter() - start
             tensors = {"image": image.contiguous()}
             if mixture is not None:
-                tensors[FULL] = rendered.image.contiguous()
+                tensors[FULL] = full.contiguous()
             if params.maps:
                 tensors |= view_maps(rendered)
                 surfaces[view.name] = _first_surface(view, tensors)
             if "transparent" in rendered.maps and view.mask is not None:
                 given = RenderOptions(masks="given")
-                seen = method.render(view.camera, stage.until, Mode.EVALUATE, given, view.mask).image
-                tensors[GIVEN] = (seen if mixture is None else mixture.of(view.camera, seen)).contiguous()
+                seen = finer.full(view, given)
+                tensors[GIVEN] = (seen if mixture is None else finer.mixed(view, seen, given)).contiguous()
+        if params.refine_steps:
+            tensors[REFINED] = _from_refined_pose(finer, view, params.refine_steps)
         save_file(tensors, context.out / "views" / f"{stem}.safetensors")
         write_png(context.out / "images" / f"{stem}.png", to_bytes(image))
     if surfaces:
         save_file(_coverage(method, scene, stage.until, surfaces), context.out / COVERAGE)
-    RenderTimes(seconds, params.maps).write(context.out)
+    if params.preview:
+        _write_preview(method, scene, stage.until, mixture, params.preview, context.out / PREVIEW)
+    if method.light is not None:
+        frame = mean_frame(torch.stack([view.camera.rotation for view in scene.train]))
+        save_environment(context.out / ENVIRONMENT, method.light, frame, _ENVIRONMENT_SIDE)
+    RenderTimes({**seconds}, params.maps).write(context.out)
     if seconds:
         context.log.info("rendered %d test views, %.3f s each", len(seconds), sum(seconds.values()) / len(seconds))
+
+
+@dataclass(frozen=True)
+class _Finer:
+    """The images of a method without maps, ``times`` finer and averaged."""
+
+    method: Model
+    mixture: Mixture | None
+    step: int
+    times: int
+
+    def full(self, view: View, options: RenderOptions) -> Tensor:
+        """(3, H, W) of the method alone."""
+        from rtgs.evaluate.supersample import supersampled
+
+        return supersampled(lambda camera, mask: self._image(camera, mask, options), view.camera, view.mask, self.times)
+
+    def mixed(self, view: View, full: Tensor, options: RenderOptions) -> Tensor:
+        """(3, H, W) with what the judge replaced, of an image ``full`` of the method alone."""
+        from rtgs.evaluate.supersample import supersampled
+
+        mixture = self.mixture
+        assert mixture is not None
+        if self.times == 1:
+            return mixture.of(view.camera, full)
+
+        def render(camera: Camera, mask: Tensor | None) -> Tensor:
+            return mixture.of(camera, self._image(camera, mask, options))
+
+        return supersampled(render, view.camera, view.mask, self.times)
+
+    def _image(self, camera: Camera, mask: Tensor | None, options: RenderOptions) -> Tensor:
+        from rtgs.methods import Mode
+
+        return self.method.render(camera, self.step, Mode.EVALUATE, options, mask).image
+
+
+def _from_refined_pose(finer: _Finer, view: View, steps: int) -> Tensor:
+    """(3, H, W) the view from the pose that is best fitted to its photo, made as its image from the given pose is."""
+    import torch
+
+    from rtgs.methods import RenderOptions
+    from rtgs.methods.refine_pose import refine_pose
+
+    refined = replace(view, camera=refine_pose(finer.method, view, finer.step, steps=steps))
+    with torch.no_grad():
+        full = finer.full(refined, RenderOptions())
+        return (full if finer.mixture is None else finer.mixed(refined, full, RenderOptions())).contiguous()
+
+
+def _write_preview(method: Model, scene: Scene, step: int, mixture: Mixture | None, count: int, path: Path) -> None:
+    """``count`` frames on a path that suits the capture; nothing where its photos are from one place."""
+    import torch
+
+    from rtgs.evaluate.images import to_bytes
+    from rtgs.methods import Mode
+    from rtgs.render.paths import picture_of, suited_path
+    from rtgs.report.films import write_preview
+
+    cameras = [view.camera for view in (*scene.train, *scene.test)]
+    frames = []
+    for camera in suited_path(cameras, picture_of(cameras, PREVIEW_SIDE), count):
+        with torch.no_grad():
+            image = method.render(camera, step, Mode.EVALUATE).image
+            frames.append(to_bytes(image if mixture is None else mixture.of(camera, image)))
+    if frames:
+        write_preview(path, frames, PREVIEW_RATE, PREVIEW_BYTES)
 
 
 def _coverage(method: Model, scene: Scene, step: int, surfaces: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -185,7 +289,16 @@ def read_timed(folder: Path, times: RenderTimes, view_name: str, camera: Camera 
         normal = None if camera is None else torch.einsum("ij,jhw->ihw", camera.rotation.float(), normal)
     surface, glass = (tensors.get("depth"), normal), {name: tensors.get(name) for name in GLASS_LAYERS}
     seconds, framed = times.of(view_name), read_coverage(folder, view_name)
-    return TimedRender(tensors["image"], seconds, *layers, tensors.get(GIVEN), *surface, **glass, framed=framed)
+    return TimedRender(
+        tensors["image"],
+        seconds,
+        *layers,
+        tensors.get(GIVEN),
+        *surface,
+        **glass,
+        framed=framed,
+        refined=tensors.get(REFINED),
+    )
 
 
-STEP = StepKind("render", 5, render)
+STEP = StepKind("render", 7, render)

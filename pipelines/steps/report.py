@@ -10,18 +10,21 @@ from typing import TYPE_CHECKING
 
 from pipelines.steps import extract_mesh
 from pipelines.steps.evaluate import TABLE_JSON
+from pipelines.steps.external import ExternalRecord
 from pipelines.steps.judge import STEP as JUDGE
-from pipelines.steps.render import RenderTimes
-from pipelines.steps.training import last_training, read_history, read_summary
-from pipelines.steps.views import read_coverage, read_render
+from pipelines.steps.render import ENVIRONMENT, PREVIEW, RenderTimes
+from pipelines.steps.training import read_summary
 from rtgs.core.decisions import Decision
 from rtgs.core.records import damaged
 from rtgs.evaluate.judgement import JudgeRecord
 from rtgs.mesh.record import RECORD_FILE, MeshRecord
+from rtgs.runs.training import has_training, last_training, read_history
+from rtgs.runs.views import read_coverage, read_render
 from rtgs.workflow import StepContext, StepKind
 from rtgs.workflow.manifest import Manifest
 
 if TYPE_CHECKING:
+    import numpy as np
     from torch import Tensor
 
     from rtgs.evaluate.records import EvaluationTable
@@ -53,16 +56,15 @@ def report(params: ReportParams, context: StepContext) -> None:
 
     inputs = context.inputs
     table = read_json(inputs["evaluate"] / TABLE_JSON)
-    training = last_training(inputs)
-    summary = read_summary(training)
-    manifest = Manifest.read(training)
+    training = last_training(inputs) if has_training(inputs) else None
+    manifest = Manifest.read(training or inputs["render"])
     assert manifest is not None
     decisions = [Decision(*item) for item in params.decisions]
     decisions += _prepared(inputs)
-    decisions += summary.decisions
+    decisions += _external(inputs) if training is None else read_summary(training).decisions
     mesh = MeshRecord.read(inputs["extract_mesh"]) if "extract_mesh" in inputs else None
     decisions += () if mesh is None else mesh.decisions  # how the transparent object's mesh was chosen
-    decisions += _boundary(training)
+    decisions += [] if training is None else _boundary(training)
     decisions += _guide(table)
     decisions += JudgeRecord.read(inputs[JUDGE.name]).decisions() if JUDGE.name in inputs else ()
     data = ReportData(
@@ -77,11 +79,26 @@ def report(params: ReportParams, context: StepContext) -> None:
         config=tuple(ConfigLine(key, *both) for key, both in sorted(params.config.items())),
         machine={key: str(value) for key, value in (manifest.machine | manifest.versions).items()},
         mesh=None if mesh is None else _mesh(inputs["extract_mesh"], mesh),
+        preview=_preview(inputs["render"] / PREVIEW),
+        environment=_environment(inputs["render"] / ENVIRONMENT),
         timed="per view, maps included" if RenderTimes.read(inputs["render"]).with_maps else "per view",
     )
     size = write_report(context.out / PAGE, data)
     context.log.info("report of %.1f MB", size / 1e6)
     context.tracker.artifact(context.out / PAGE)
+
+
+def _external(inputs: Mapping[str, Path]) -> list[Decision]:
+    """What the pictures of another program are."""
+    record = ExternalRecord.read(inputs["render"])
+    return [] if record is None else [Decision("external pictures", note) for note in record.notes]
+
+
+def _preview(path: Path) -> str:
+    """The moving picture as an address; empty: there is none."""
+    from rtgs.report.figures import data_uri
+
+    return data_uri(path.read_bytes(), "image/webp") if path.is_file() else ""
 
 
 def _prepared(inputs: Mapping[str, Path]) -> list[Decision]:
@@ -124,12 +141,13 @@ def _views(table: EvaluationTable, context: StepContext, count: int) -> tuple[Re
 
 def _layers(maps: dict[str, Tensor]) -> dict[str, Tensor]:
     """The layers of a rendered view as the page takes them; none for methods without reflection."""
-    from rtgs.evaluate.layers import LAYERS
+    from rtgs.evaluate.layers import LAYERS, added_by_base
 
     if "reflection" not in maps:
         return {}
     names = (*LAYERS, "normal", "specular", "roughness", "f0")
-    return {"diffuse": (1 - maps["specular"]) * maps["diffuse"]} | {name: maps[name] for name in names if name in maps}
+    whole = {"diffuse": added_by_base(maps)} if {"specular", "diffuse"} <= maps.keys() else {}
+    return whole | {name: maps[name] for name in names if name in maps}
 
 
 def _boundary(training: Path) -> list[Decision]:
@@ -155,6 +173,16 @@ def _guide(table: EvaluationTable) -> list[Decision]:
         )
         lines.append(Decision("mesh and true container", f"{why}{front}, second {back}"))
     return lines
+
+
+def _environment(folder: Path) -> np.ndarray | None:
+    """The panorama of the far light; None: the method has none."""
+    import numpy as np
+    from PIL import Image
+
+    from rtgs.light.pictures import PANORAMA
+
+    return np.asarray(Image.open(folder / PANORAMA).convert("RGB")) if folder.is_dir() else None
 
 
 def _mesh(folder: Path, record: MeshRecord) -> MeshFigure | None:
@@ -201,4 +229,4 @@ def _steps(context: StepContext) -> tuple[StepLine, ...]:
     return tuple(lines)
 
 
-STEP = StepKind("report", 7, report)
+STEP = StepKind("report", 8, report)

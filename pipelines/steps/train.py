@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipelines.steps.extract_mesh import why_absent
-from pipelines.steps.training import StageParams, last_training, load_method, train_stage
+from pipelines.steps.training import train_stage
 from rtgs.methods import MethodSpec, StageSpec, find_method, is_own, own_methods
+from rtgs.runs.training import StageParams, last_training, load_method
 from rtgs.train.networks import Named, check_networks, named_in_key
 from rtgs.workflow import Step, StepContext, StepKind
 from rtgs.workflow.fingerprint import file_digest, fingerprint

@@ -1,47 +1,28 @@
-"""What the training steps share: parameters, the run of one stage, and reading a trained method back."""
+"""What the training steps share: the run of one stage, and what it records."""
 
 from __future__ import annotations
 
 import json
 import math
 import shutil
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import asdict, fields
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from rtgs.core.build import build
 from rtgs.core.documents import DocumentError, parse_json
-from rtgs.core.errors import RtgsError
 from rtgs.core.records import read_json, record_of, write_json
-from rtgs.methods.settings import MethodSettings
+from rtgs.runs.training import CHECKPOINT_FOLDER, HISTORY_FILE, OBJECT_FOLDER, StageParams
 from rtgs.track import Tracker
-from rtgs.train.settings import ScheduleSettings
 from rtgs.workflow import StepContext
-from rtgs.workflow.manifest import Manifest
 
 if TYPE_CHECKING:
     from rtgs.mesh.container import ObjectMesh
     from rtgs.methods.model import Model
-    from rtgs.scenes.scene import Scene
     from rtgs.train.trainer import TrainSummary
 
-CHECKPOINT_FOLDER = "checkpoint"
 SUMMARY_FILE = "summary.json"
-HISTORY_FILE = "history.jsonl"
-OBJECT_FOLDER = "object_mesh"
-
-
-@dataclass(frozen=True)
-class StageParams:
-    """One stage of a training: the recipe, the seed, and which stretch of steps."""
-
-    method: MethodSettings
-    schedule: ScheduleSettings
-    seed: int
-    stage: str
-    from_step: int
-    until: int
 
 
 def train_stage(params: StageParams, context: StepContext, object_mesh: ObjectMesh | None = None) -> Model:
@@ -53,13 +34,14 @@ def train_stage(params: StageParams, context: StepContext, object_mesh: ObjectMe
 
     Raises:
         TrainingDiverged: a loss or gradient is not finite.
+        TrainingStopped: who looks on asked for the end; the next attempt goes on from there.
     """
     from pipelines.steps.pictures import FOLDER, TrainingPictures
     from rtgs.gaussians.ply import write_ply
     from rtgs.mesh.container import write_object_mesh
     from rtgs.methods import Stage, create_method
     from rtgs.scenes.canonical import read_scene
-    from rtgs.train.progress import progress_for
+    from rtgs.train.progress import SharedProgress, progress_for
     from rtgs.train.seeds import generator_for
     from rtgs.train.trainer import Trainer
 
@@ -70,15 +52,21 @@ def train_stage(params: StageParams, context: StepContext, object_mesh: ObjectMe
     checkpoints = context.partial / "checkpoints"
     _start_from_stage_before(context, checkpoints)
     recorder = HistoryRecorder(context.partial / HISTORY_FILE, context.tracker)
+    progress = progress_for(quiet=context.quiet)
+    if context.onlooker is not None:
+        context.onlooker.attend(scene, object_mesh, progress)
+        progress = SharedProgress(progress, context.onlooker)
     trainer = Trainer(
         method,
         scene,
         seed=params.seed,
         stage=stage,
-        progress=progress_for(quiet=context.quiet),
+        progress=progress,
         recorder=recorder,
         checkpoint_dir=checkpoints,
         observer=TrainingPictures(scene, context.partial / FOLDER, params.schedule.total),
+        watch=params.watch,
+        onlooker=context.onlooker,
     )
     summary = trainer.run()
     newest = max(checkpoints.glob("step_*"))
@@ -87,7 +75,7 @@ def train_stage(params: StageParams, context: StepContext, object_mesh: ObjectMe
         (context.out / OBJECT_FOLDER).mkdir()
         write_object_mesh(context.out / OBJECT_FOLDER, object_mesh)
     for part in method.sets:
-        write_ply(context.out / f"{part.name}.ply", part.gaussians)
+        write_ply(context.out / f"{part.name}.ply", part.shown())
     record = {key: _finite(value) for key, value in asdict(summary).items()}
     write_json(context.out / SUMMARY_FILE, record)
     recorder.write_history(context.out / HISTORY_FILE)
@@ -127,24 +115,25 @@ class HistoryRecorder:
                 json.dumps({"step": step, **{key: _finite(float(value)) for key, value in values.items()}}) + "\n"
             )
 
+    def forget_after(self, step: int) -> None:
+        """Drop what a killed attempt recorded beyond the checkpoint it is resumed from."""
+        kept = [json.dumps(row) + "\n" for row in self._rows() if row["step"] <= step]
+        whole = self.path.with_name(f"{self.path.name}.tmp")
+        whole.write_text("".join(kept), encoding="utf-8")
+        whole.replace(self.path)
+
     def write_history(self, path: Path) -> None:
-        """The history without what a killed attempt recorded past the checkpoint it was resumed from."""
+        """The history, one line for each step."""
         rows: dict[int, dict[str, float]] = {}
-        lines = self.path.read_text(encoding="utf-8").splitlines() if self.path.exists() else []
-        for line in lines:
-            try:
-                row = parse_json(line)
-            except DocumentError:  # cut by a kill; what follows was recorded by the attempt after
-                continue
-            rows = {step: kept for step, kept in rows.items() if step <= row["step"]}
+        for row in self._rows():
             rows[row["step"]] = rows.get(row["step"], {}) | row
         path.write_text("".join(json.dumps(rows[step]) + "\n" for step in sorted(rows)), encoding="utf-8")
 
-
-def read_history(folder: Path) -> list[dict[str, float]]:
-    """Recorded metrics of a training artifact: one mapping per iteration, with its ``step``."""
-    lines = (folder / HISTORY_FILE).read_text(encoding="utf-8").splitlines()
-    return [{key: value for key, value in parse_json(line).items() if value is not None} for line in lines]
+    def _rows(self) -> Iterator[dict[str, Any]]:
+        lines = self.path.read_text(encoding="utf-8").splitlines() if self.path.exists() else []
+        for line in lines:
+            with suppress(DocumentError):  # cut by a kill; what follows was recorded by the attempt after
+                yield parse_json(line)
 
 
 def read_summary(folder: Path) -> TrainSummary:
@@ -161,43 +150,3 @@ def read_summary(folder: Path) -> TrainSummary:
         if item.type == "float" and values.get(item.name, 0.0) is None:  # JSON has no NaN and no infinity
             values[item.name] = math.nan
     return record_of(TrainSummary, values, path)
-
-
-def stage_params(folder: Path) -> StageParams:
-    """The parameters a training artifact was made with, from its manifest.
-
-    Raises:
-        RtgsError: the folder is no artifact.
-    """
-    manifest = Manifest.read(folder)
-    if manifest is None:
-        raise RtgsError(f"{folder} has no readable manifest: run `rtgs cache gc`, then the command again")
-    return build(StageParams, manifest.params)
-
-
-def load_method(folder: Path, scene: Scene) -> tuple[Model, StageParams]:
-    """The method as it was at the end of a training stage, with the object mesh that the artifact carries."""
-    from rtgs.mesh.container import read_object_mesh
-    from rtgs.methods import create_method
-    from rtgs.train.checkpoint import load_checkpoint
-    from rtgs.train.seeds import generator_for
-
-    params = stage_params(folder)
-    mesh = read_object_mesh(folder / OBJECT_FOLDER) if (folder / OBJECT_FOLDER).is_dir() else None
-    method = create_method(params.method, scene, params.schedule, generator_for(params.seed, "initialise"), mesh)
-    tensors = load_checkpoint(folder / CHECKPOINT_FOLDER).tensors
-    prefix = "method."
-    method.load({name[len(prefix) :]: tensor for name, tensor in tensors.items() if name.startswith(prefix)})
-    return method, params
-
-
-def last_training(inputs: Mapping[str, Path]) -> Path:
-    """The folder of the training stage that ends latest among the inputs of a step.
-
-    Raises:
-        RtgsError: no training artifact among them.
-    """
-    folders = [folder for name, folder in inputs.items() if name.startswith("train_")]
-    if not folders:
-        raise RtgsError(f"no training step among the inputs {sorted(inputs)}")
-    return max(folders, key=lambda folder: stage_params(folder).until)

@@ -10,6 +10,7 @@ from rtgs.config.convert import to_run_config, with_own
 from rtgs.config.locate import conf_dir
 from rtgs.config.schema import Choices, RunConfig, register_schema
 from rtgs.core.build import build
+from rtgs.core.credentials import redact
 from rtgs.methods.settings import MethodSettings
 from rtgs.train.settings import ScheduleSettings
 
@@ -74,9 +75,18 @@ def without_hydra(composed: DictConfig) -> DictConfig:
 
 
 def choices_from(groups: Mapping[str, object], overrides: Sequence[str]) -> Choices:
-    """Hydra's record of chosen files and overrides as :class:`Choices`."""
+    """Hydra's record of chosen files and overrides as :class:`Choices`.
+
+    Where a run is tracked and who looks at it is no part of what it is: these words are left out, and credentials
+    with them.
+    """
     names = {str(key): str(value) for key, value in groups.items() if value is not None}
     chosen = {key: names.get(key, "") for key in ("method", "preset", "ablation", "experiment")}
-    told_otherwise = {*names, "hydra", "paths.root", "name", "threads"} - {"sfm", "masks", "normals", "judge"}
-    keys = [item for item in overrides if item.split("=", 1)[0].lstrip("+~") not in told_otherwise]
-    return Choices(**chosen, scene_file=names.get("scene", ""), overrides=tuple(keys))
+    told_otherwise = {*names, "hydra", "paths.root", "name", "threads", "view"} - {"sfm", "masks", "normals", "judge"}
+    elsewhere = ("tracking.", "viewer.")
+    keys = [item for item in overrides if _key(item) not in told_otherwise and not _key(item).startswith(elsewhere)]
+    return Choices(**chosen, scene_file=names.get("scene", ""), overrides=tuple(map(redact, keys)))
+
+
+def _key(override: str) -> str:
+    return override.split("=", 1)[0].lstrip("+~")

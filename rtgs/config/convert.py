@@ -3,21 +3,29 @@
 from __future__ import annotations
 
 import os
-import re
+from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from rtgs.config.names import derive_name, run_name
 from rtgs.config.schema import Choices, RunConfig
+from rtgs.config.words import FOLDER_CHOICE, quoted
 from rtgs.core.build import build
+from rtgs.core.credentials import ADDRESSES, hide
 from rtgs.core.errors import RtgsError
 from rtgs.methods import find_method, own_methods
 from rtgs.methods.settings import MethodSettings
 from rtgs.methods.spec import FEATURES
 
-_UNTELLING = {"images", "input", "rgb", "sparse", "colmap", "0", "data", "dense", "undistorted"}
+
+def hide_credentials(composed: DictConfig) -> None:
+    """From now on :func:`rtgs.core.credentials.redact` finds the secrets in the addresses of this config."""
+    for key in ADDRESSES:
+        with suppress(OmegaConfBaseException):  # what cannot be resolved stops the run when it is converted
+            hide(str(OmegaConf.select(composed, key, default="")))
 
 
 def to_run_config(composed: DictConfig, choices: Choices) -> tuple[RunConfig, Choices]:
@@ -27,6 +35,7 @@ def to_run_config(composed: DictConfig, choices: Choices) -> tuple[RunConfig, Ch
         RtgsError: a mandatory value is missing or an interpolation fails (names the key); the ablation is not for the
             method.
     """
+    hide_credentials(composed)
     try:
         values = OmegaConf.to_container(composed, resolve=True, throw_on_missing=True)
     except OmegaConfBaseException as error:
@@ -34,7 +43,9 @@ def to_run_config(composed: DictConfig, choices: Choices) -> tuple[RunConfig, Ch
     assert isinstance(values, dict)
     config = build(RunConfig, {str(key): value for key, value in values.items()})
     _refuse_idle_ablation(config, choices)
+    config = _of_external(config)
     config = replace(config, method=with_own(config.method))
+    find_method(config.method.name).refuse_poses(config.method)
     scene = config.scene
     if config.table.data == "paper" and scene.path.startswith("embedded:"):
         raise RtgsError(
@@ -43,18 +54,28 @@ def to_run_config(composed: DictConfig, choices: Choices) -> tuple[RunConfig, Ch
         )
     if not scene.path:
         raise RtgsError(
-            "config: scene.path is empty; choose a scene (scene=fox) or give a folder (scene.path=/my/photos)"
+            "config: scene.path is empty; choose a scene (scene=demo) or give a folder (scene.path=/my/photos)"
         )
     if ":" not in scene.path.split("/")[0]:
         scene = replace(scene, path=_absolute(scene.path))
     if not scene.name:
         scene = replace(scene, name=derive_name(scene.path))
     choices = replace(choices, scene=scene.name)
+    if choices.scene_file.startswith(FOLDER_CHOICE):  # so that others can repeat the run
+        words = (f"scene.path={quoted(scene.path)}", *choices.overrides)
+        choices = replace(choices, scene_file="capture", overrides=words)
     config = replace(config, scene=scene, paths=replace(config.paths, root=_absolute(config.paths.root)))
-    name = config.name or run_name(choices, config.seed, judged=judged(config))
+    name = config.name or own_name(config, choices)
     if name != Path(name).name or name == "..":
         raise RtgsError(f"config: name={name!r} is to be one folder in runs/: give a name without / that is not ..")
     return replace(config, name=name), choices
+
+
+def own_name(config: RunConfig, choices: Choices) -> str:
+    """The run's name where none is given: :func:`rtgs.config.names.run_name`, of other programs with theirs."""
+    pictures, program = pictures_only(config), config.external.name
+    row = f"external_{derive_name(program)}" if program and pictures else ""
+    return run_name(choices, config.seed, judged=judged(config), row=row, pictures=pictures and not program)
 
 
 def with_own(method: MethodSettings) -> MethodSettings:
@@ -79,6 +100,10 @@ def _refuse_idle_ablation(config: RunConfig, choices: Choices) -> None:
     needs = set(config.ablation.needs)
     if unknown := sorted(needs - set(FEATURES)):
         raise RtgsError(f"config: ablation.needs names {', '.join(unknown)}: methods may have {', '.join(FEATURES)}")
+    if pictures_only(config) and choices.ablation not in ("", "none"):
+        raise RtgsError(
+            f"config: ablation={choices.ablation} takes nothing away from method external, which is pictures"
+        )
     if needs and (lacking := sorted(needs - find_method(config.method.name).has)):
         fit = ", ".join(spec.name for spec in own_methods() if needs <= spec.has)
         raise RtgsError(
@@ -87,34 +112,39 @@ def _refuse_idle_ablation(config: RunConfig, choices: Choices) -> None:
         )
 
 
+def pictures_only(config: RunConfig) -> bool:
+    """Whether the run scores pictures of another program instead of training."""
+    return find_method(config.method.name).elsewhere
+
+
+def _of_external(config: RunConfig) -> RunConfig:
+    """With absolute folders, where pictures of another program are scored.
+
+    Raises:
+        RtgsError: the run asks for what only a training has.
+    """
+    if not pictures_only(config):
+        return config
+    external = config.external
+    evaluation = config.evaluation
+    asked = {
+        f"judge.plain={config.judge.plain}": config.judge.plain != "",
+        "mesh.extract=true": config.mesh.extract,
+        f"evaluation.supersample={evaluation.supersample}": evaluation.supersample != 1,
+        "evaluation.refined_poses=always": evaluation.refined_poses == "always",
+        "watch.cpu_seconds": bool(config.watch.cpu_seconds),
+        "watch.steps": bool(config.watch.steps),
+    }
+    if wrong := [word for word, is_asked in asked.items() if is_asked]:
+        raise RtgsError(f"config: {wrong[0]} with method=external: there is nothing but pictures; leave it out")
+    folders = {key: _absolute(path) for key in ("renders", "layers") if (path := getattr(external, key))}
+    return replace(config, external=replace(external, **folders))
+
+
 def _absolute(path: str) -> str:
     return str(Path(os.path.expandvars(path)).expanduser().absolute().resolve())
-
-
-def derive_name(path: str) -> str:
-    """A scene's name from its folder: the last part that tells something, in letters, digits, dash, underscore."""
-    parts = [part for part in Path(path.split(":", 1)[-1]).parts if part not in ("/", ".")]
-    telling = [part for part in parts if part.lower() not in _UNTELLING]
-    name = (telling or parts or ["scene"])[-1]
-    return re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_") or "scene"
 
 
 def judged(config: RunConfig) -> bool:
     """Whether a plain method is compared with the run's own."""
     return config.judge.plain not in ("", config.method.name)
-
-
-def run_name(choices: Choices, seed: int, *, judged: bool = False) -> str:
-    """Folder name of a run: ``fox-2dgs-quick``, with the ablation and the seed where they are not the default.
-
-    Scenes of a dataset are called with it (``ref_real_sedan``): a stand-in may have the same name.
-    """
-    of_dataset = choices.scene_file.endswith(f"/{choices.scene}")
-    parts = [choices.scene_file if of_dataset else choices.scene, choices.method, choices.preset]
-    if choices.ablation not in ("", "none"):
-        parts.append(choices.ablation)
-    if judged:
-        parts.append("judged")
-    if seed:
-        parts.append(f"seed{seed}")
-    return "-".join(part.replace("/", "_") for part in parts if part)

@@ -9,8 +9,8 @@ import typing
 
 from hydra.errors import OverrideParseException
 
+from rtgs.config.keys import config_keys
 from rtgs.config.locate import choices_of
-from rtgs.config.schema import RunConfig
 from rtgs.config.synthesize import SynthesizeConfig
 
 
@@ -31,10 +31,42 @@ def explain(error: BaseException) -> str:
         text += _advice_for_choice(*match.groups())
     match = re.search(r"Key '([^']+)' (?:is )?not in", text)
     if match:
-        keys = all_keys(RunConfig) | all_keys(SynthesizeConfig)
-        close = difflib.get_close_matches(match.group(1), sorted(keys), n=3)
-        text += f"\nDid you mean {' or '.join(close)}?" if close else "\n`rtgs run --help` lists all keys."
+        close = close_keys(match.group(1))
+        text += f"\nDid you mean {' or '.join(close)}?" if close else "\n`rtgs explain` lists all keys."
     return text
+
+
+def close_keys(name: str) -> list[str]:
+    """Keys and groups of keys that somebody may mean who writes ``name``, the likeliest first, three at most."""
+    if name in _ELSEWHERE:
+        return [_ELSEWHERE[name]]
+    places = [
+        *config_keys(),
+        *{key.rpartition(".")[0] for key in config_keys() if "." in key},
+        *all_keys(SynthesizeConfig),
+    ]
+    last = {}
+    for place in sorted(set(places), key=lambda place: (place.count("."), place)):
+        last.setdefault(place.rpartition(".")[2], []).append(place)
+    if name in last:
+        return last[name][:3]
+    close = difflib.get_close_matches(name, sorted(last), n=3)
+    return [place for word in close for place in last[word]][:3]
+
+
+_ELSEWHERE = {
+    **dict.fromkeys(("iterations", "iters", "steps", "max_steps", "max_num_iterations", "epochs"), "schedule.total"),
+    **dict.fromkeys(("data", "source_path", "path", "input", "dataset"), "scene.path"),
+    **dict.fromkeys(("resolution", "size", "width", "downscale_factor"), "scene.long_side"),
+    **dict.fromkeys(("lambda_dssim", "ssim_lambda"), "method.loss.dssim"),
+    **dict.fromkeys(("output", "output_dir", "model_path"), "paths.root"),
+    **dict.fromkeys(("workers", "num_workers", "jobs"), "hydra.launcher.workers"),
+    **dict.fromkeys(("cap_max", "max_gaussians", "num_gaussians"), "method.density.max_surfels"),
+    "sh_degree": "method.init.sh_degree",
+    "test_every": "scene.split_every",
+    "llffhold": "scene.split_every",
+}
+"""Keys of ours by the words of other programs: 3DGS, nerfstudio, gsplat."""
 
 
 def explain_yaml(error: BaseException) -> str:

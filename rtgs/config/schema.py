@@ -12,14 +12,15 @@ from typing import Any, Literal
 
 from rtgs.core.refuse import refuse_below, refuse_outside, refuse_unknown_words, refuse_unless, words_of
 from rtgs.evaluate.publish import OWN_DATA, DataKind
-from rtgs.evaluate.settings import EvaluationSettings
+from rtgs.evaluate.settings import EvaluationSettings, ExternalSettings
 from rtgs.mesh.settings import MeshSource, ObjectSettings, TsdfSettings
 from rtgs.methods.settings import MethodSettings
 from rtgs.prepare.masks.settings import MaskSettings
 from rtgs.prepare.settings import NormalSettings, SfmSettings
 from rtgs.scenes.settings import SceneSettings
 from rtgs.track import TrackingKind
-from rtgs.train.settings import ScheduleSettings
+from rtgs.train.settings import ScheduleSettings, WatchSettings
+from rtgs.view.settings import ViewerSettings
 
 SCHEMA_NAME = "run_schema"
 _DOT = "__"  # in the names of twins
@@ -31,6 +32,7 @@ class PathsConfig:
     """Where results go: ``<root>/store`` (cached artifacts), ``<root>/runs`` (results), tracking and logs beside."""
 
     root: str = "."
+    """The folder that holds store/, runs/, tables/ and what is tracked."""
     remote: str = ""
     """A store that machines share (``s3://bucket/path``, any URL of fsspec).
 
@@ -46,6 +48,11 @@ class PathsConfig:
     def tables(self) -> Path:
         """One folder per table of an experiment."""
         return Path(self.root) / "tables"
+
+    @property
+    def figures(self) -> Path:
+        """One folder per figure of ``rtgs figures``."""
+        return Path(self.root) / "figures"
 
     @property
     def runs(self) -> Path:
@@ -122,6 +129,10 @@ class TableConfig:
     name: str = ""
     """Folder under ``<root>/tables``, the preset is added. Empty: no table is written."""
     title: str = ""
+    kind: Literal["results", "time_quality"] = "results"
+    """``results`` at the end of each run, or ``time_quality``: along the way (``watch``), a plot for each scene."""
+    minutes: tuple[float, ...] = (1.0, 2.0, 5.0, 10.0)
+    """Of ``time_quality``: CPU minutes after which runs are compared."""
     data: DataKind = OWN_DATA
     """``stand_in`` (scenes named after the paper's), ``paper`` (its data: differences are formed) or ``own``."""
     paper_scenes: dict[str, str] = field(default_factory=dict)
@@ -158,13 +169,18 @@ class RunConfig:
     normals: NormalSettings = field(default_factory=NormalSettings)
     method: MethodSettings = field(default_factory=MethodSettings)
     schedule: ScheduleSettings = field(default_factory=ScheduleSettings)
+    watch: WatchSettings = field(default_factory=WatchSettings)
     evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
+    external: ExternalSettings = field(default_factory=ExternalSettings)
     mesh: MeshConfig = field(default_factory=MeshConfig)
     ablation: AblationConfig = field(default_factory=AblationConfig)
     judge: JudgeConfig = field(default_factory=JudgeConfig)
     table: TableConfig = field(default_factory=TableConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     paths: PathsConfig = field(default_factory=PathsConfig)
+    viewer: ViewerSettings = field(default_factory=ViewerSettings)
+    view: bool = False
+    """Show the model in the browser while it trains (docs/view.md); nothing of the result depends on it."""
     seed: int = 0
     """Seed of everything random."""
     name: str | None = None

@@ -2,23 +2,42 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
 from rtgs.config.locate import choices_of
 
+FOLDER_CHOICE = "folder_"  # how choices of ``scene`` begin that stand for a folder in a list of several scenes
+_TAKE_A_VALUE = (
+    "--cfg",
+    "-c",
+    "--package",
+    "-p",
+    "--config-path",
+    "-cp",
+    "--config-name",
+    "-cn",
+    "--config-dir",
+    "-cd",
+)
+
 
 def friendly_overrides(arguments: Sequence[str]) -> list[str]:
-    """Make a folder as good as a scene's name: ``scene=/my/capture`` or ``scene.path=/my/capture`` alone."""
+    """Make a folder as good as a scene's name: ``scene=/my/capture``, ``scene.path=/my/capture`` or ``/my/capture``
+    alone, also among several: ``scene=demo,/my/capture``."""
     rewritten: list[str] = []
-    for argument in arguments:
+    for argument in _with_keys(arguments):
         key, _, value = argument.partition("=")
         plain = value.strip("'\"")
-        if key == "scene" and "," not in value and plain not in choices_of("scene") and _is_path(plain, arguments):
-            rewritten += ["scene=capture", f"scene.path={_quoted(plain)}"]
+        if key == "scene" and "," in value and not Path(plain).expanduser().exists():
+            rewritten.append(f"scene={','.join(_choice(each, arguments) for each in value.split(','))}")
+        elif key == "scene" and plain not in choices_of("scene") and _is_path(plain, arguments):
+            rewritten += ["scene=capture", f"scene.path={quoted(plain)}"]
         elif key == "scene.path" and not value.startswith(("'", '"')) and Path(value).expanduser().exists():
-            rewritten.append(f"scene.path={_quoted(value)}")
+            rewritten.append(f"scene.path={quoted(value)}")
         else:
             rewritten.append(argument)
     keys = {argument.partition("=")[0] for argument in rewritten}
@@ -26,6 +45,30 @@ def friendly_overrides(arguments: Sequence[str]) -> list[str]:
         rewritten.append("scene=capture")
     options = [argument for argument in rewritten if not _is_override(argument)]
     return options + [argument for argument in rewritten if _is_override(argument)]  # argparse wants them in one piece
+
+
+def _with_keys(arguments: Sequence[str]) -> list[str]:
+    """A word without a key that is a scene or a path becomes ``scene=``, unless an option before it wants it."""
+    found: list[str] = []
+    for before, argument in zip(("", *arguments), arguments):
+        alone = "=" not in argument and not argument.startswith(("-", "~")) and before not in _TAKE_A_VALUE
+        is_scene = alone and (argument in choices_of("scene") or _is_path(argument, ()))
+        found.append(f"scene={argument}" if is_scene else argument)
+    return found
+
+
+def _choice(text: str, arguments: Sequence[str]) -> str:
+    """A name of a scene as it is; of a folder one that stands for it, which Hydra knows from now on."""
+    from hydra.core.config_store import ConfigStore
+
+    plain = text.strip("'\"")
+    if plain in choices_of("scene") or not _is_path(plain, arguments):
+        return text
+    place = str(Path(os.path.expandvars(plain)).expanduser().absolute())
+    readable = re.sub(r"[^A-Za-z0-9]+", "_", Path(place).name)
+    name = f"{FOLDER_CHOICE}{readable}_{hashlib.sha256(place.encode()).hexdigest()[:8]}"
+    ConfigStore.instance().store(group="scene", name=name, node={"name": "", "path": place}, provider="rtgs")
+    return name
 
 
 def _is_path(text: str, arguments: Sequence[str]) -> bool:
@@ -38,6 +81,7 @@ def _is_override(argument: str) -> bool:
     return argument.startswith("~") or ("=" in argument and not argument.startswith("-"))
 
 
-def _quoted(text: str) -> str:
+def quoted(text: str) -> str:
+    """A value in quotes, as Hydra takes it whatever is in it."""
     escaped = text.replace("\\", "\\\\").replace("'", "\\'") if "'" in text else text
     return f"'{escaped}'"

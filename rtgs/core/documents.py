@@ -6,7 +6,8 @@ Every function raises :class:`DocumentError` with the reason alone; the caller n
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -42,12 +43,8 @@ def parse_json(text: str | bytes) -> Any:
     """
     if len(text) > JSON_BYTES:
         raise DocumentError(f"{len(text)} bytes of JSON, at most {JSON_BYTES} are read")
-    try:
+    with _refused(ValueError):
         return _within_limits(json.loads(text))
-    except RecursionError as error:
-        raise DocumentError(f"it is nested more than {DEPTH} levels deep") from error
-    except ValueError as error:
-        raise _reason(error) from error
 
 
 def load_toml(path: Path) -> dict[str, Any]:
@@ -59,12 +56,8 @@ def load_toml(path: Path) -> dict[str, Any]:
     import tomllib
 
     text = _text(path, TYPED_BYTES)
-    try:
+    with _refused(ValueError):
         return _within_limits(tomllib.loads(text))
-    except RecursionError as error:
-        raise DocumentError(f"it is nested more than {DEPTH} levels deep") from error
-    except ValueError as error:
-        raise _reason(error) from error
 
 
 def load_yaml(path: Path) -> Any:
@@ -76,13 +69,20 @@ def load_yaml(path: Path) -> Any:
     import yaml
 
     text = _text(path, TYPED_BYTES)
-    try:
-        loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    with _refused(yaml.YAMLError, ValueError, TypeError, AttributeError, LookupError):  # PyYAML on odd tags
         _refuse_large_yaml(yaml.parse(text, Loader=loader))
         return _within_limits(yaml.load(text, Loader=loader))
+
+
+@contextmanager
+def _refused(*errors: type[Exception]) -> Iterator[None]:
+    """These errors of a parser, and nesting beyond its depth, as a :class:`DocumentError`."""
+    try:
+        yield
     except RecursionError as error:
         raise DocumentError(f"it is nested more than {DEPTH} levels deep") from error
-    except (yaml.YAMLError, ValueError, TypeError, AttributeError, LookupError) as error:  # PyYAML on odd tags
+    except errors as error:
         raise _reason(error) from error
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import types
 import typing
 from collections.abc import Mapping, Sequence
@@ -14,6 +13,7 @@ from typing import Any, TypeVar
 from rtgs.core.build import build
 from rtgs.core.documents import load_json
 from rtgs.core.errors import RtgsError
+from rtgs.core.files import whole_file
 from rtgs.core.refuse import shown
 
 T = TypeVar("T")
@@ -25,9 +25,9 @@ STORED = (
 
 def write_json(path: Path, values: Mapping[str, object]) -> None:
     """Write an object with one rename: a kill leaves the file that was there, or none."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
-    partial.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
-    os.replace(partial, path)
+    text = json.dumps(values, indent=1) + "\n"
+    with whole_file(path) as partial:
+        partial.write_text(text, encoding="utf-8")
 
 
 def read_json(path: Path, remedy: str = STORED) -> dict[str, Any]:

@@ -76,10 +76,10 @@ def refuse_outside(settings: object, where: str, low: float, high: float, *names
 def shown(value: object, longest: int = 80) -> str:
     """A value for a message, cut where it is long; nothing a file holds makes a message of megabytes."""
     if isinstance(value, dict | list | tuple):
-        return f"a {type(value).__name__} of {len(value)}" if len(value) > 8 else _cut(_parts(value), longest)
+        return f"a {type(value).__name__} of {len(value)}" if len(value) > 8 else cut(_parts(value), longest)
     if isinstance(value, int) and value.bit_length() > 200:
         return f"a whole number of {value.bit_length()} bits"
-    return _cut(repr(value[: longest + 1]) if isinstance(value, str | bytes) else repr(value), longest)
+    return cut(repr(value[: longest + 1]) if isinstance(value, str | bytes) else repr(value), longest)
 
 
 def _parts(value: dict[Any, Any] | list[Any] | tuple[Any, ...]) -> str:
@@ -93,7 +93,8 @@ def _part(value: object) -> str:
     return f"a {type(value).__name__} of {len(value)}" if isinstance(value, dict | list | tuple) else shown(value)
 
 
-def _cut(text: str, longest: int) -> str:
+def cut(text: str, longest: int) -> str:
+    """A text for a message, at most so many characters of it."""
     return text if len(text) <= longest else f"{text[:longest]}..."
 
 

@@ -14,11 +14,13 @@ from rtgs.evaluate.coverage import FRAMED_BY
 from rtgs.evaluate.flip import flip_map
 from rtgs.evaluate.images import ERROR_FULL_SCALE, error_map, error_scale_note, write_png
 from rtgs.evaluate.layers import GLASS_LAYERS, LayerTruth, layer_scales, layer_scores, metrics_of, why_absent
-from rtgs.evaluate.metrics import psnr, quantized, ssim
+from rtgs.evaluate.metrics import cc_psnr, psnr, quantized, ssim
 from rtgs.evaluate.records import (
+    COLOR_METRIC,
     FRAMED_METRICS,
     GIVEN_MASK_METRICS,
     METRICS,
+    POSE_METRIC,
     SURFACE_METRICS,
     WHOLE_SURFACE_METRIC,
     EvaluationTable,
@@ -62,6 +64,7 @@ class TimedRender:
     contents: Tensor | None = None  # (3, H, W) part that comes straight from inside it
     behind: Tensor | None = None  # (3, H, W) part that comes straight through it
     framed: Tensor | None = None  # (H, W) training views that show what the pixel shows
+    refined: Tensor | None = None  # (3, H, W) the image from a pose that was fitted to the photo
 
 
 EVERYTHING = EvaluationSettings()
@@ -126,6 +129,9 @@ def _score(render: TimedRender, view: PhotoView, settings: EvaluationSettings, m
     image, target, mask = render.image, view.image, view.mask
     values: dict[str, float | None] = dict.fromkeys(METRICS)
     values["psnr"], values["ssim"] = psnr(image, target), ssim(image, target)
+    values[COLOR_METRIC] = cc_psnr(image, target)
+    if render.refined is not None:
+        values[POSE_METRIC] = psnr(render.refined, target)
     seen = flip_map(image, target)
     values["flip"] = float(seen.mean())
     values["render_seconds"] = render.seconds
@@ -173,6 +179,8 @@ def _explain_absent(rows: Sequence[ViewScore], settings: EvaluationSettings, mis
             missing[name] = "switched off (evaluation.masked=false)"
         elif name in GIVEN_MASK_METRICS:
             missing[name] = "the method has no stage for transparent objects, or the view no mask"
+        elif name == POSE_METRIC:
+            missing[name] = "no poses are learned (method.poses.enabled, evaluation.refined_poses)"
         elif name in FRAMED_METRICS:
             missing[name] = f"{absent} of {len(rows)} views were rendered without maps, or show nothing that is framed"
         elif name == WHOLE_SURFACE_METRIC:

@@ -7,7 +7,7 @@ up to one factor is told apart from a wrong one by a second figure after one sca
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 import torch
@@ -21,6 +21,12 @@ from rtgs.scenes.truth import srgb_from_linear
 GLASS_LAYERS = ("inner", "contents", "behind")  # parts of the transmission, of methods that render them; their truths
 LAYERS = {"reflection": "reflected", "transmission": "transmitted"} | {name: name for name in GLASS_LAYERS}
 """Of a render, and the name of their truth."""
+BASE = "base"  # of methods that add the reflection: what is left of the image without it
+
+
+def added_by_base(maps: Mapping[str, Tensor]) -> Tensor:
+    """(3, H, W) what the base set adds to an image with these layers: (1 - k_s) C_d, or the layer ``base``."""
+    return maps[BASE] if BASE in maps else (1 - maps["specular"]) * maps["diffuse"]
 
 
 class LayerTruth(SurfaceTruth, Protocol):

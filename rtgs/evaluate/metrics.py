@@ -12,6 +12,7 @@ from torch import Tensor
 
 from rtgs.core.image_pair import checked_pair
 
+_SMALLEST = 1e-8  # variance and slope of a colour fit below which there is none (gsplat)
 MSE_FLOOR = 1e-10  # EnvGS and 3DGS-family codes; identical images give 100 dB instead of infinity
 
 
@@ -47,6 +48,23 @@ def psnr(image: Tensor, target: Tensor, *, mask: Tensor | None = None) -> float:
     squared = (image - target).square().mean(0)
     mse = _mean(squared, mask)
     return float(-10.0 * torch.log10(mse.clamp_min(MSE_FLOOR)))
+
+
+def cc_psnr(image: Tensor, target: Tensor) -> float:
+    """PSNR after a gain and an offset of each channel that fit the render to the photo; gsplat's ``cc_psnr``.
+
+    As gsplat fits it: least squares of render = a photo + b over the pixels of a channel, then (render - b) / a,
+    clamped to [0, 1]. The fit explains the render by the photo, so where both differ by more than a and b the result
+    may be below :func:`psnr`. Render and photo as there.
+    """
+    image, target = checked_pair(image, target)
+    render, photo = image.flatten(1), target.flatten(1)
+    mean, shown = photo.mean(1, keepdim=True), render.mean(1, keepdim=True)
+    spread = (photo.square().mean(1, keepdim=True) - mean.square()).clamp_min(_SMALLEST)
+    slope = ((render * photo).mean(1, keepdim=True) - mean * shown) / spread
+    slope = torch.where(slope.abs() < _SMALLEST, 1.0, slope)
+    corrected = ((render - (shown - slope * mean)) / slope).clamp(0, 1)
+    return psnr(corrected.reshape(image.shape), target)
 
 
 def ssim(image: Tensor, target: Tensor, *, mask: Tensor | None = None) -> float:

@@ -9,7 +9,7 @@ from typing import Literal
 
 from rtgs.core.refuse import refuse_unknown_words
 from rtgs.evaluate.records import EvaluationTable
-from rtgs.evaluate.tables import PaperScore, paper_score
+from rtgs.evaluate.tables import PaperScore, paper_row, paper_rows, paper_score
 
 DataKind = Literal["stand_in", "paper", "own"]
 STAND_IN: DataKind = "stand_in"
@@ -85,7 +85,11 @@ TRUTH = (  # of path-traced scenes
     Metric("object_distance", "mesh to container, diagonals", 4, False),
 )
 MESH = (Metric("object_silhouette_iou", "IoU of mesh and masks", 3, None),)  # real captures have it too
-ALL = (*QUALITY, *COSTS, *MESH, *TRUTH)
+PHOTOS = (  # in CSV files alone: these have seen the test photos
+    Metric("cc_psnr", "PSNR after a colour fit", 2, True),
+    Metric("psnr_refined_poses", "PSNR from refined poses", 2, True),
+)
+ALL = (*QUALITY, *COSTS, *MESH, *TRUTH, *PHOTOS)
 
 
 @dataclass(frozen=True)
@@ -115,12 +119,20 @@ class Cell:
 
 @dataclass(frozen=True)
 class PaperTable:
-    """All cells, methods and scenes in the order of the runs."""
+    """All cells, methods and scenes in the order of the runs.
+
+    Attributes:
+        published: what the paper prints, by (row, scene): of the rows that were run, then of those that were not.
+            On its own data. Empty where the scenes have nothing to do with the paper's.
+        paper_scenes: the paper's name of each scene.
+    """
 
     spec: TableSpec
     methods: tuple[str, ...]
     scenes: tuple[str, ...]
     cells: Mapping[tuple[str, str], Cell]
+    published: Mapping[tuple[str, str], PaperScore] = field(default_factory=dict)
+    paper_scenes: Mapping[str, str] = field(default_factory=dict)
 
     def cell(self, method: str, scene: str) -> Cell | None:
         """The cell, or None where this method was not run on this scene (or failed)."""
@@ -129,8 +141,16 @@ class PaperTable:
     @property
     def blocks(self) -> tuple[tuple[str, tuple[str, ...]], ...]:
         """(heading, methods) of each block of rows; one without a heading where the table has none."""
+        return self._grouped(self.methods)
+
+    @property
+    def blocks_with_published(self) -> tuple[tuple[str, tuple[str, ...]], ...]:
+        """The same with the paper's rows that were not run, which come last."""
+        return self._grouped((*self.methods, *(row for row, _ in self.published)))
+
+    def _grouped(self, rows: Sequence[str]) -> tuple[tuple[str, tuple[str, ...]], ...]:
         groups: dict[str, list[str]] = {}
-        for method in self.methods:
+        for method in dict.fromkeys(rows):
             groups.setdefault(block_of(self.spec, method), []).append(method)
         return tuple((heading, tuple(methods)) for heading, methods in groups.items())
 
@@ -159,7 +179,23 @@ def build_table(spec: TableSpec, runs: Sequence[Measured]) -> PaperTable:
     ranks = _ranks(values, spec)
     cells = {key: _cell(key, group, values[key], ranks[key], spec) for key, group in groups.items()}
     methods = tuple(dict.fromkeys(method for method, _ in groups))
-    return PaperTable(spec, methods, tuple(dict.fromkeys(scene for _, scene in groups)), cells)
+    scenes = {run.evaluation.facts.scene: run.paper_scene for run in runs}
+    published = {} if spec.data == OWN_DATA else _published(methods, scenes)
+    return PaperTable(spec, methods, tuple(scenes), cells, published, scenes)
+
+
+def _published(methods: Sequence[str], scenes: Mapping[str, str]) -> dict[tuple[str, str], PaperScore]:
+    """By row and scene; ``scenes``: the paper's name of each."""
+    found: dict[tuple[str, str], PaperScore] = {}
+    for scene, papers in scenes.items():
+        found |= {(row, scene): score for row in methods if (score := paper_score(row, papers)) is not None}
+    ran, ablations = {paper_row(row) for row in methods}, any("," in row for row in methods)
+    for scene, papers in scenes.items():
+        for row in paper_rows(papers, ablations=ablations):
+            score = paper_score(row, papers)
+            if row not in ran and score is not None:
+                found[row, scene] = score
+    return found
 
 
 def _value(key: str, group: Sequence[Measured]) -> Value | None:

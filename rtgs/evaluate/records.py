@@ -14,10 +14,9 @@ from rtgs.core.errors import RtgsError
 from rtgs.core.listing import spreadsheet_cell
 
 FORMAT = "rtgs-evaluation"
-VERSION = (
-    6  # 2: layers; 3: transmission, given masks; 4: surface in the mask, object's mesh; 5: what is framed; 6: FLIP
-)
-_READ = (5, VERSION)  # a figure that a version did not know is absent
+# 2: layers; 3: transmission, given masks; 4: surface in the mask, object's mesh; 5: what is framed; 6: FLIP; 7: photos
+VERSION = 7
+_READ = (5, 6, VERSION)  # a figure that a version did not know is absent
 LAYER_METRICS = (
     "psnr_specular",
     "psnr_diffuse_part",
@@ -33,7 +32,9 @@ WHOLE_SURFACE_METRIC = "depth_off"  # share of the whole picture whose depth is 
 FRAMED_METRICS = ("psnr_framed", "framed_share")
 # Seen through the test views' own masks instead of the mesh's silhouette (method.md 7; decision 21).
 GIVEN_MASK_METRICS = ("psnr_given_masks", "psnr_masked_given_masks", "ssim_masked_given_masks")
-# In the order of the columns. Higher is better for psnr*, ssim*, *_share*; lower for lpips*, flip*, *_error*,
+# After a colour fit to each photo; from poses fitted to the photos. Neither is psnr: both have seen the test photos.
+COLOR_METRIC, POSE_METRIC = "cc_psnr", "psnr_refined_poses"
+# In the order of the columns. Higher is better for psnr*, cc_psnr, ssim*, *_share*; lower for lpips*, flip*, *_error*,
 # *_degrees*, *_off.
 METRICS = (
     "psnr",
@@ -51,6 +52,8 @@ METRICS = (
     *SURFACE_METRICS,
     *FRAMED_METRICS,
     WHOLE_SURFACE_METRIC,
+    COLOR_METRIC,
+    POSE_METRIC,
     "psnr_8bit",
     "ssim_8bit",
     "lpips_01_8bit",
@@ -104,6 +107,8 @@ class RunFacts:
     train_seconds: float | None = None  # by the wall
     train_cpu_seconds: float | None = None  # all threads
     peak_memory_mb: float | None = None
+    supersample: int = 1  # pictures were rendered so many times finer, and averaged
+    noise_psnr: float | None = None  # dB of the test photos against noise-free ones: no method can be told to be better
 
 
 @dataclass(frozen=True)
@@ -153,9 +158,11 @@ class EvaluationTable:
 
     @property
     def resolution(self) -> str:
-        """``WxH``, or the range when the views differ; empty without views."""
+        """``WxH``, or the range when the views differ, and supersampling; empty without views."""
         sizes = sorted({(row.width, row.height) for row in self.rows})
-        return " to ".join(f"{width}x{height}" for width, height in dict.fromkeys(sizes[:1] + sizes[-1:]))
+        text = " to ".join(f"{width}x{height}" for width, height in dict.fromkeys(sizes[:1] + sizes[-1:]))
+        times = self.facts.supersample
+        return text if times == 1 or not sizes else f"{text}, {times}x{times} samples a pixel"
 
     def _present(self, metric: str) -> list[float]:
         if metric not in (*METRICS, *GLASS_METRICS):
@@ -166,10 +173,13 @@ class EvaluationTable:
 
 def write_json(path: Path, table: EvaluationTable) -> None:
     """The whole table; absent figures are null and explained under ``missing``."""
+    facts = asdict(table.facts)
+    if table.facts.supersample == 1:  # the file stays what it was before there was such a setting
+        del facts["supersample"]
     document = {
         "format": FORMAT,
         "version": VERSION,
-        "facts": asdict(table.facts),
+        "facts": facts,
         "resolution": table.resolution,
         "mean": {name: table.mean(name) for name in table.metrics},
         "std": {name: table.std(name) for name in table.metrics},
@@ -203,8 +213,9 @@ def read_json(path: Path) -> EvaluationTable:
 def write_csv(path: Path, table: EvaluationTable) -> None:
     """One line per view, then mean and std; an absent figure is an empty field."""
     facts = asdict(table.facts)
+    del facts["supersample"]  # in the resolution of the mean
     header = ["scene", "method", "preset", "view", "resolution", "mask_share", *table.metrics]
-    header += ["steps", "surfels", "train_seconds", "train_cpu_seconds", "peak_memory_mb"]
+    header += ["steps", "surfels", "train_seconds", "train_cpu_seconds", "peak_memory_mb", "noise_psnr"]
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.DictWriter(stream, header, restval="")

@@ -1,7 +1,7 @@
 """A paper's table as Markdown, CSV, LaTeX and HTML.
 
-The paper's own figures and the differences to them stand in columns of their own, which exist only where the data are
-the paper's: beside stand-ins they would invite a comparison that means nothing.
+The paper's own figures stand in columns of their own, marked as published on the papers' data. Differences to them are
+formed only where the data are the paper's: beside stand-ins they would mean nothing.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import io
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
+from rtgs.core.files import whole_file
 from rtgs.core.listing import spreadsheet_cell
 from rtgs.evaluate.publish import (
     ALL,
@@ -42,9 +43,8 @@ def write_table(folder: Path, table: PaperTable) -> tuple[Path, ...]:
         ("html", page(table)),
     ):
         path = folder / f"table.{suffix}"
-        temporary = path.with_suffix(f".{suffix}.tmp")
-        temporary.write_text(text, encoding="utf-8")
-        temporary.replace(path)
+        with whole_file(path) as temporary:
+            temporary.write_text(text, encoding="utf-8")
         written.append(path)
     return tuple(written)
 
@@ -73,8 +73,10 @@ def notes(table: PaperTable) -> tuple[str, ...]:
     if table.spec.data == STAND_IN:
         found.append(
             "The scenes are path-traced stand-ins named after the paper's: its figures are for other data and not "
-            "comparable, so they are not shown."
+            "comparable, so no differences are formed."
         )
+    if any(row not in table.methods for row, _ in table.published):
+        found.append("Rows that have published figures alone were not run here.")
     if max(seeds) > 1:
         fewer = f" ({seeds[0]} where runs are missing)" if len(seeds) > 1 else ""
         found.append(f"Mean ± sample standard deviation over {max(seeds)} seeds{fewer}; smaller differences are noise.")
@@ -143,8 +145,18 @@ def _rows(
     return rows
 
 
+def _published(table: PaperTable, method: str) -> list[str]:
+    """The paper's figures of a row, a cell for each scene that it has; they are on its own data."""
+    scores = [table.published.get((method, scene)) for scene in _published_scenes(table)]
+    return ["" if paper is None else f"{paper.psnr:.2f} / {paper.ssim:.3f} / {paper.lpips:.3f}" for paper in scores]
+
+
+def _published_scenes(table: PaperTable) -> list[str]:
+    return [scene for scene in table.scenes if any(scene == other for _, other in table.published)]
+
+
 def _paper_rows(table: PaperTable) -> list[list[str]]:
-    """The paper's figures and ours minus theirs; none where the data are not the paper's."""
+    """Ours minus the paper's figures; none where the data are not the paper's."""
     rows = []
     for method in table.methods:
         cells = [table.cell(method, scene) for scene in table.scenes]
@@ -152,9 +164,7 @@ def _paper_rows(table: PaperTable) -> list[list[str]]:
             continue
         row = [method]
         for cell in cells:
-            paper = None if cell is None else cell.paper
-            row.append("" if paper is None else f"{paper.psnr:.2f} / {paper.ssim:.3f} / {paper.lpips:.3f}")
-            row.append("" if cell is None or paper is None else _difference(cell))
+            row.append("" if cell is None or cell.paper is None else _difference(cell))
         rows.append(row)
     return rows
 
@@ -173,10 +183,7 @@ def _difference(cell: Cell) -> str:
 
 
 def _paper_header(table: PaperTable) -> list[str]:
-    header = ["method"]
-    for scene in table.scenes:
-        header += [f"{scene}: paper's PSNR / SSIM / LPIPS", f"{scene}: ours - paper's"]
-    return header
+    return ["method", *(f"{scene}: ours - paper's PSNR / SSIM / LPIPS" for scene in table.scenes)]
 
 
 def _header(table: PaperTable, metrics: Iterable[Metric]) -> list[str]:
@@ -197,11 +204,15 @@ def _blocks(
     for part, metrics in parts.items():
         values = [cell.values for cell in table.cells.values()]
         known = [m for m in metrics if not part or any(each[m.key] is not None for each in values)]
-        for block, methods in table.blocks if known else ():
+        for block, methods in (table.blocks if part else table.blocks_with_published) if known else ():
             heading = ": ".join(text for text in (block, part) if text)
-            blocks.append((heading, _header(table, known), _rows(table, methods, known, marks, pm)))
+            header, rows = _header(table, known), _rows(table, methods, known, marks, pm)
+            if not part:
+                header += [f"{table.paper_scenes[scene]} {_PUBLISHED}" for scene in _published_scenes(table)]
+                rows = [[*row, *_published(table, method)] for row, method in zip(rows, methods, strict=True)]
+            blocks.append((heading, header, rows))
     if paper := _paper_rows(table):
-        blocks.append(("The paper's figures", _paper_header(table), paper))
+        blocks.append(("Against the paper's figures", _paper_header(table), paper))
     return blocks
 
 
@@ -210,6 +221,7 @@ def _blocks(
 _MARKDOWN = {1: ("**", "**"), 2: ("<u>", "</u>"), 3: ("*", "*")}
 _LATEX = {1: (r"\textbf{", "}"), 2: (r"\underline{", "}"), 3: (r"\textit{", "}")}
 _HTML = {1: ("<b class=first>", "</b>"), 2: ("<b class=second>", "</b>"), 3: ("<b class=third>", "</b>")}
+_PUBLISHED = "published, on the papers' data: PSNR / SSIM / LPIPS"  # behind the paper's name of the scene
 _LEGEND = "First, second and third of each column are marked {}."
 
 
@@ -230,23 +242,42 @@ def _escaped_pipe(text: str) -> str:
     return text.replace("|", "\\|")
 
 
-# The paper has the first three of QUALITY.
+# The paper has the first three of QUALITY; on its own data, "paper_", differences are formed.
+_PUBLISHED_COLUMNS = ("published_psnr", "published_ssim", "published_lpips")
 _PAPER_COLUMNS = ("paper_psnr", "paper_ssim", "paper_lpips")
-_PAPER_COLUMNS += ("psnr_minus_paper", "ssim_minus_paper", "lpips_minus_paper")
+_DIFFERENCE_COLUMNS = ("psnr_minus_paper", "ssim_minus_paper", "lpips_minus_paper")
 
 
 def comma_separated(table: PaperTable) -> str:
-    """One row per method and scene with everything, unrounded: for other programs."""
+    """One row per method and scene with everything, unrounded: for other programs. Rows that were not run last."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     head = ["table", "data", "scene", "method", "preset", "resolution", "views", "seeds"]
     head += [f"{m.key}{part}" for m in ALL for part in ("", "_std", "_rank")]
-    writer.writerow([*head, *(_PAPER_COLUMNS if table.spec.data == PAPER_DATA else ())])
+    ours = table.spec.data == PAPER_DATA
+    added = (*_PAPER_COLUMNS, *_DIFFERENCE_COLUMNS) if ours else _PUBLISHED_COLUMNS if table.published else ()
+    writer.writerow([*head, *added])
     for scene in table.scenes:
         for method in table.methods:
             if cell := table.cell(method, scene):
-                writer.writerow(map(spreadsheet_cell, _csv_row(table.spec, cell, ALL)))
+                row = [*_csv_row(table.spec, cell, ALL), *_csv_published(table, method, scene)[: len(added)]]
+                writer.writerow(map(spreadsheet_cell, [*row, *(_csv_differences(cell) if ours else ())]))
+    for row, scene in table.published:
+        if row not in table.methods:
+            start: list[object] = [table.spec.name, table.spec.data, scene, row]
+            blank = [""] * (len(head) - len(start))
+            rest = [""] * (len(added) - len(_PUBLISHED_COLUMNS))
+            writer.writerow(map(spreadsheet_cell, [*start, *blank, *_csv_published(table, row, scene), *rest]))
     return stream.getvalue()
+
+
+def _csv_published(table: PaperTable, method: str, scene: str) -> list[object]:
+    paper = table.published.get((method, scene))
+    return ["", "", ""] if paper is None else [paper.psnr, paper.ssim, paper.lpips]
+
+
+def _csv_differences(cell: Cell) -> list[object]:
+    return ["" if value is None else repr(value) for value in _differences(cell)]
 
 
 def _csv_row(spec: TableSpec, cell: Cell, metrics: Sequence[Metric]) -> list[object]:
@@ -256,11 +287,7 @@ def _csv_row(spec: TableSpec, cell: Cell, metrics: Sequence[Metric]) -> list[obj
         value = cell.values[metric.key]
         row += ["", ""] if value is None else [repr(value.mean), "" if value.spread is None else repr(value.spread)]
         row.append(cell.ranks.get(metric.key, ""))
-    if spec.data != PAPER_DATA:
-        return row
-    paper = cell.paper
-    row += ["", "", ""] if paper is None else [paper.psnr, paper.ssim, paper.lpips]
-    return row + ["" if value is None else repr(value) for value in _differences(cell)]
+    return row
 
 
 def latex(table: PaperTable) -> str:

@@ -56,9 +56,23 @@ PAPER_SCORES: dict[tuple[str, str], PaperScore] = {
 def paper_score(row: str, scene: str) -> PaperScore | None:
     """What the paper prints for a row of a table, ``method`` or ``method, ablation``; None: nothing.
 
-    The paper's RT-GS is that of ``rtgs_printed`` and of ``rtgs``.
+    The paper's RT-GS is that of ``rtgs_printed`` and of ``rtgs``; other programs are found however they are spelt.
     """
-    return PAPER_SCORES.get((row.replace("rtgs_printed", "rtgs", 1), scene))
+    return PAPER_SCORES.get((paper_row(row), scene))
+
+
+def paper_row(row: str) -> str:
+    """What the paper's row for a row of a table is called here: ``NU-NeRF`` is ``nu_nerf``."""
+    method, comma, ablation = row.partition(",")
+    method = method.lower().replace("-", "_").replace(" ", "_")
+    return f"{'rtgs' if method == 'rtgs_printed' else method}{comma}{ablation}"
+
+
+def paper_rows(scene: str, *, ablations: bool) -> tuple[str, ...]:
+    """The rows that the paper prints for one of its scenes: its methods or, with ``ablations``, RT-GS and what is taken
+    away from it."""
+    rows = (row for row, printed in PAPER_SCORES if printed == scene)
+    return tuple(row for row in rows if ("," in row) == ablations or (ablations and row == "rtgs"))
 
 
 @dataclass(frozen=True)
@@ -77,6 +91,8 @@ class SummaryRow:
     train_seconds: float | None
     peak_memory_mb: float | None
     surfels: int | None
+    psnr_framed: float | None = None  # over the pixels that enough training views show
+    noise_psnr: float | None = None  # of the test photos
 
 
 def summarize(tables: Sequence[EvaluationTable]) -> list[SummaryRow]:
@@ -98,6 +114,8 @@ def summarize(tables: Sequence[EvaluationTable]) -> list[SummaryRow]:
                 train_seconds=facts.train_seconds,
                 peak_memory_mb=facts.peak_memory_mb,
                 surfels=facts.surfels,
+                psnr_framed=table.mean("psnr_framed"),
+                noise_psnr=facts.noise_psnr,
             )
         )
     return rows

@@ -23,7 +23,7 @@ def activate_gaussians(gaussians: Gaussians, camera_center: Tensor, sh_degree: i
     gaussians : Surfels or Ellipsoids
         N of them, float32 on the CPU.
     camera_center : (3,) Tensor
-        World; a constant (it gets no gradient).
+        World. It gets a gradient, of the colours, where it requires one.
     sh_degree : int
         Active degree of the spherical harmonics; capped by what they hold.
 
@@ -48,7 +48,8 @@ def activate_gaussians(gaussians: Gaussians, camera_center: Tensor, sh_degree: i
             )
     raw = tuple(gaussians[name] for name in PARAMETERS)
     center = tuple(camera_center.tolist())
-    outputs = _Activate.apply(center, min(sh_degree, gaussians.sh_degree), *raw)
+    learned = camera_center if camera_center.requires_grad else None
+    outputs = _Activate.apply(learned, center, min(sh_degree, gaussians.sh_degree), *raw)
     return ActivatedGaussians(gaussians.means, *outputs)
 
 
@@ -59,7 +60,7 @@ def activate_geometry(gaussians: Gaussians) -> ActivatedGaussians:
     """
     raw = [gaussians[name] for name in PARAMETERS]
     raw[4], raw[5] = raw[4].detach(), raw[5].new_empty(len(raw[5]), 0, 3)
-    return ActivatedGaussians(gaussians.means, *_Activate.apply((0.0, 0.0, 0.0), 0, *raw))
+    return ActivatedGaussians(gaussians.means, *_Activate.apply(None, (0.0, 0.0, 0.0), 0, *raw))
 
 
 def arrays(tensors: tuple[Tensor, ...]) -> tuple:
@@ -69,10 +70,10 @@ def arrays(tensors: tuple[Tensor, ...]) -> tuple:
 
 class _Activate(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, center: tuple[float, float, float], degree: int, *raw: Tensor):
+    def forward(ctx, learned: Tensor | None, center: tuple[float, float, float], degree: int, *raw: Tensor):
         count = len(raw[0])
         rows = raw[0].new_empty
-        outputs = (rows(count, 3), rows(count, 3), torch.empty_like(raw[1]), rows(count), rows(count, 3))
+        outputs = (rows(count, 3), rows(count, 3), rows(raw[1].shape), rows(count), rows(count, 3))
         needs_backward = any(ctx.needs_input_grad)
         saved = rows(core.activation_saved_size(count)) if needs_backward else None
         core.activate_gaussians(
@@ -102,4 +103,7 @@ class _Activate(torch.autograd.Function):
             arrays(gradients),
             torch.get_num_threads(),
         )
-        return None, None, *gradients
+        by_center = None
+        if ctx.needs_input_grad[0]:  # the means that pass here are read for the direction from the centre alone
+            by_center = -gradients[0].double().sum(0).to(gradients[0].dtype)
+        return by_center, None, None, *gradients

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -76,12 +76,19 @@ def move(moving: Sequence[Moving], updates: int, betas: tuple[float, float], eps
 
     Raises:
         NonFiniteGradientError: a gradient held NaN or inf. Such values counted as 0, all others were applied.
+        RuntimeError: values or moments are not contiguous, so that the call could only move a copy of them.
     """
     entries = []
     for each in moving:
         assert each.values.grad is not None
+        for what, tensor in (("values", each.values), ("first", each.first), ("second", each.second)):
+            if not tensor.is_contiguous():
+                raise RuntimeError(
+                    f"{what} of {each.name} {tuple(tensor.shape)} have the strides {tensor.stride()}; Adam moves "
+                    "contiguous tensors in place: call .contiguous() where they are made"
+                )
         tensors = (each.values.detach(), each.values.grad.contiguous(), each.first, each.second)
-        entries.append((*(t.numpy() for t in tensors), each.active, each.rate / (1 - betas[0] ** updates)))
+        entries.append((*(t.numpy() for t in tensors), each.active, float(each.rate / (1 - betas[0] ** updates))))
         increment_version(each.values)  # a graph that still needs the old values refuses its backward pass
     second_scale = 1 / math.sqrt(1 - betas[1] ** updates)
     if core.adam_step(entries, *betas, eps, second_scale, torch.get_num_threads()):
@@ -116,6 +123,9 @@ class GaussianAdam:
         self.settings = settings
         self.extent = extent
         self.means_lr_steps = means_lr_steps
+        self.scheduled: Mapping[
+            str, Callable[[int], float]
+        ] = {}  # rates by name, of a step, instead of those of the settings
         self.steps = 0  # updates done: the t of the bias correction
         self.sh_degree = 0  # highest degree ever active
         self.first = _zeros_like(gaussians)
@@ -124,7 +134,7 @@ class GaussianAdam:
     def learning_rates(self, step_index: int) -> dict[str, float]:
         """Rate of each parameter at a step (from 0); that of the means decays exponentially and is in world units.
 
-        The others are constant, or fall as :meth:`OptimizerSettings.decay` says.
+        The others are constant, or fall as :meth:`OptimizerSettings.decay` says; those in :attr:`scheduled` are given.
         """
         s = self.settings
         share = min(max(step_index / self.means_lr_steps, 0.0), 1.0)
@@ -132,7 +142,8 @@ class GaussianAdam:
         rates = {name: getattr(s, name) for name in PARAMETERS if name != "means"}
         rates |= {c.name: getattr(s, c.name) if c.rate is None else c.rate for c in self.gaussians.channels}
         factor = s.decay(share)
-        return {name: factor * rate for name, rate in rates.items()} | {"means": means * self.extent}
+        found = {name: factor * rate for name, rate in rates.items()} | {"means": means * self.extent}
+        return found | {name: rate(step_index) for name, rate in self.scheduled.items() if name in found}
 
     def step(self, step_index: int, sh_degree: int | None = None) -> None:
         """Update every parameter in place from its ``.grad`` (parameters without one are left alone).

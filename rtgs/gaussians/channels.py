@@ -1,8 +1,8 @@
 """Channels: what a set of Gaussians holds for each row besides shape, opacity and colour, by name.
 
-A channel is trained and composited like a colour. The set holds its raw values; an activation from the table
-:data:`ACTIVATIONS` makes of them what a renderer composites. Optimiser, density control, checkpoints and PLY files go
-by :attr:`Channel.name`.
+A channel is trained and, unless it says otherwise, composited like a colour. The set holds its raw values; an
+activation from the table :data:`ACTIVATIONS` makes of them what a renderer composites. Optimiser, density control,
+checkpoints and PLY files go by :attr:`Channel.name`.
 """
 
 from __future__ import annotations
@@ -52,6 +52,7 @@ class Channel:
     rate: float | None = None  # Adam's; None: the optimiser's setting of this name
     # Lowest and highest raw value, clamped to after every step. None: those of an opacity's logit; of logits alone.
     bounds: tuple[float, float] | None = None
+    composited: bool = True  # False: no column of the image, but what a part makes its columns of
 
     def __post_init__(self) -> None:
         if not self.name.isidentifier():
@@ -88,7 +89,7 @@ class Channel:
 
     @property
     def columns(self) -> int:
-        """How many composited columns it takes."""
+        """How many columns one row has."""
         return self.shape[0] if self.shape else 1
 
     @property
@@ -120,7 +121,7 @@ def check_channels(channels: tuple[Channel, ...], parameters: tuple[str, ...]) -
     names = [*parameters, *(channel.name for channel in channels)]
     if double := {name for name in names if names.count(name) > 1}:
         raise ValueError(f"parameters named twice: {', '.join(sorted(double))}")
-    columns = COLOR_COLUMNS + sum(channel.columns for channel in channels)
+    columns = COLOR_COLUMNS + sum(channel.columns for channel in channels if channel.composited)
     if columns > MAX_CHANNELS:
         raise ValueError(f"a colour and channels of {columns - COLOR_COLUMNS} columns: at most {MAX_CHANNELS} in all")
 

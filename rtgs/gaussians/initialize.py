@@ -134,7 +134,8 @@ def surface_orientations(points: Tensor, neighbors: int = 10) -> Tensor:
     _, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))  # columns, by ascending eigenvalue
     normal, longest = axes[:, :, 0], axes[:, :, 2]
     frames = np.stack((longest, np.cross(normal, longest), normal), axis=2)
-    return torch.from_numpy(Rotation.from_matrix(frames).as_quat()[:, [3, 0, 1, 2]]).float()
+    turns = Rotation.from_matrix(frames).as_quat()[:, [3, 0, 1, 2]]  # laid out by columns
+    return torch.from_numpy(turns).float().contiguous()
 
 
 def neighbor_distance(points: Tensor, neighbors: int) -> Tensor:

@@ -5,13 +5,12 @@ are raw (logit of opacity, log of scales, quaternion w x y z of any length); f_r
 coefficients of red, then green, then blue. Of other tools' files the same names are read, in any order, whatever else
 they hold; PlayCanvas' compressed files are read with ``gsply``.
 Channels follow, raw too, under the names of ``Channel.properties`` (materials: specular roughness f0_0..); viewers
-ignore them.
+ignore them. A comment ``SplatRenderMode: 2dgs`` or ``default`` says how Brush and SuperSplat draw them.
 """
 
 from __future__ import annotations
 
 import math
-import os
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +19,7 @@ import torch
 from torch import Tensor
 
 from rtgs.core.errors import RtgsError
+from rtgs.core.files import whole_file
 from rtgs.core.ply_header import PlyHeaderError, PlySizeError, check_ply
 from rtgs.gaussians.channels import Channel
 from rtgs.gaussians.ellipsoids import Ellipsoids
@@ -31,6 +31,7 @@ from rtgs.gaussians.surfels import Surfels
 THIRD_LOG_SCALE = math.log(1e-6)  # what viewers get as the thickness of a surfel
 THICKEST_LOG_SCALE = -10.0  # a third scale above this is no surfel's
 COMMENT = "surfels (2D Gaussians): scale_0, scale_1 along columns 0, 1 of the rotation"
+RENDER_MODES = {True: "SplatRenderMode: 2dgs", False: "SplatRenderMode: default"}  # a comment that viewers look for
 
 
 def write_ply(path: str | Path, gaussians: Gaussians, third_scale: bool = True) -> None:
@@ -82,12 +83,9 @@ def write_ply(path: str | Path, gaussians: Gaussians, third_scale: bool = True) 
     for name, column in columns.items():
         vertices[name] = column.numpy()
     element = plyfile.PlyElement.describe(vertices, "vertex")
-    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        plyfile.PlyData([element], text=False, byte_order="<", comments=[COMMENT] if flat else []).write(str(partial))
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+    comments = [*([COMMENT] if flat else []), RENDER_MODES[flat]]
+    with whole_file(path) as partial:
+        plyfile.PlyData([element], text=False, byte_order="<", comments=comments).write(str(partial))
 
 
 def read_ply(path: str | Path, *, channels: tuple[Channel, ...] | None = None) -> Surfels:
@@ -197,8 +195,8 @@ def _read_compressed(path: Path) -> Ellipsoids:
         import gsply  # pyright: ignore[reportMissingImports]  (an extra)
     except ImportError as error:
         raise RtgsError(
-            f"{path} is a compressed splat: `pip install 'rtgs[compressed]'` (the package gsply) reads it, or "
-            "`splat-transform in.compressed.ply out.ply` makes a plain one of it"
+            f"{path} is a compressed splat: `pip install -e '.[compressed]'` in the clone of rtgs (the package gsply) "
+            "reads it, or `splat-transform in.compressed.ply out.ply` makes a plain one of it"
         ) from error
     try:
         data = gsply.plyread(str(path))

@@ -36,7 +36,7 @@ class ActivatedGaussians:
 def activate(surfels: Gaussians, camera_center: Tensor, sh_degree: int) -> ActivatedGaussians:
     """Activate with plain torch (any dtype, differentiable): the readable twin of ``activate_gaussians``.
 
-    ``camera_center`` (3,) world, taken as constant; SH above ``sh_degree`` is left out. A mean at the camera centre has
+    ``camera_center`` (3,) world; SH above ``sh_degree`` is left out. A mean at the camera centre has
     no direction: its colour is that of degree 0, with no gradient by it.
     """
     tangent_u, tangent_v = tangents(surfels.quaternions)

@@ -144,6 +144,12 @@ class MeshGuide:
         answer = self._scene.run(origins.astype(np.float32), directions.astype(np.float32), output=True)
         return answer["primID"] >= 0
 
+    def distance(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """(R,) float32 distance to the first crossing in front of the origins, in lengths of the directions; inf where
+        there is none; one cast."""
+        answer = self._scene.run(origins.astype(np.float32), directions.astype(np.float32), output=True)
+        return np.where(answer["primID"] >= 0, answer["tfar"], np.inf).astype(np.float32)
+
     def nearest(self, camera: Camera) -> Tensor:
         """(H, W) float32 z-depth of the first crossing on every pixel ray, 0 where there is none; one cast."""
         rays = camera.rays(torch.float64)

@@ -98,7 +98,7 @@ def read_mesh_ply(path: Path) -> TriangleMesh:
 
 def _columns(element: PlyElement, names: tuple[str, ...]) -> np.ndarray:
     """(N, 3) float32; a property that is a list is refused."""
-    with np.errstate(over="ignore"):  # doubles beyond float32 become inf, which the mesh refuses
+    with np.errstate(over="ignore", invalid="ignore"):  # what is beyond float32 becomes inf, which the mesh refuses
         return np.stack([np.asarray(element[name]).astype(np.float32) for name in names], axis=1)
 
 

@@ -161,7 +161,11 @@ class _Fusion:
         """Integrate, marching cubes, then the largest pieces."""
         settings = self.settings
         with_color = self.observations[0].pixels is not None
-        found = self._integrated(with_color).extract_triangle_mesh(weight_threshold=settings.min_weight)
+        try:
+            found = self._integrated(with_color).extract_triangle_mesh(weight_threshold=settings.min_weight)
+        except RuntimeError as error:  # Open3D makes no mesh without a vertex
+            count = len(self.observations)
+            raise RtgsError(f"the depths of {count} views form no surface at a voxel of {self.voxel:g}") from error
         vertices = found.vertex.positions.numpy() if "positions" in found.vertex else np.empty((0, 3), np.float32)
         faces = found.triangle.indices.numpy() if "indices" in found.triangle else np.empty((0, 3), np.int32)
         colors = np.clip(found.vertex.colors.numpy(), 0, 1) if with_color and len(vertices) else None

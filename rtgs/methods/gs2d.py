@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from rtgs.methods.family import DIFFUSE
-from rtgs.methods.spec import SURFACE, MethodSpec
+from rtgs.methods.spec import HARMONICS, RASTERIZED, SURFACE, MethodSpec
 
 if TYPE_CHECKING:
     from rtgs.methods.model import Model
@@ -26,4 +26,4 @@ def build(setup: Setup) -> Model:
     return Model(setup, (base,), (*surface_terms(setup), *mcmc_terms(base, setup)))
 
 
-SPEC = MethodSpec("2dgs", (DIFFUSE,), build, frozenset({SURFACE}))
+SPEC = MethodSpec("2dgs", (DIFFUSE,), build, frozenset({HARMONICS, SURFACE, RASTERIZED}))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from rtgs.methods.family import DIFFUSE
-from rtgs.methods.spec import MethodSpec
+from rtgs.methods.spec import HARMONICS, RASTERIZED, MethodSpec
 
 if TYPE_CHECKING:
     from rtgs.methods.model import Model
@@ -28,4 +28,4 @@ def build(setup: Setup) -> Model:
     return Model(setup, (base,), (*surface_terms(setup), *mcmc_terms(base, setup)))
 
 
-SPEC = MethodSpec("3dgs", (DIFFUSE,), build)
+SPEC = MethodSpec("3dgs", (DIFFUSE,), build, frozenset({HARMONICS, RASTERIZED}))

@@ -41,13 +41,13 @@ Terms = Sequence[LossTerm | Decision]
 SURFACE_LOSSES = ("normal", "mono_normal", "distortion")
 
 
-def refuse_surface_losses(settings: MethodSettings) -> None:
+def refuse_surface_losses(settings: MethodSettings, names: Sequence[str] = SURFACE_LOSSES) -> None:
     """For Gaussians that have no surface.
 
     Raises:
         ValueError: a loss is on that needs one.
     """
-    for name in SURFACE_LOSSES:
+    for name in names:
         if weight := getattr(settings.loss, name):
             raise ValueError(
                 f"method.loss.{name}={weight:g}, but the ellipsoids of method {settings.name} have no surface to "

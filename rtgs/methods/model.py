@@ -14,8 +14,10 @@ from torch import Tensor
 from rtgs.core.cameras import Camera
 from rtgs.core.decisions import Decision
 from rtgs.methods.parts.base import BaseSet
+from rtgs.methods.parts.exposure import Exposure
 from rtgs.methods.parts.gaussian_set import GaussianSet
 from rtgs.methods.parts.part import Frame, Part, Raster
+from rtgs.methods.parts.poses import Poses
 from rtgs.methods.spec import Setup
 from rtgs.train.method import (
     LossValues,
@@ -30,6 +32,7 @@ from rtgs.train.parameters import ParameterGroup
 from rtgs.train.terms import LossTerm, table_of
 
 if TYPE_CHECKING:
+    from rtgs.light.cubemap import DirectionalLight
     from rtgs.methods.settings import MethodSettings
     from rtgs.scenes.scene import View
 
@@ -67,12 +70,14 @@ class Model:
         self.stages = setup.stages
         self.generator = setup.generator
         self.extent = setup.scene.extent
+        learned = photo_parts(setup)
+        parts = (*parts, *learned)
         self.parts = {part.name: part for part in parts}
         if len(self.parts) < len(parts):
             names = ", ".join(part.name for part in parts)
             raise ValueError(f"method {setup.spec.name} has two parts of one name: {names}")
         self.base = first
-        found = tuple(terms)
+        found = (*terms, *(term for part in learned for term in part.terms()))
         self.loss = table_of(setup.settings.loss, (term for term in found if isinstance(term, LossTerm)))
         self._decisions = (*(term for term in found if isinstance(term, Decision)), *setup.decisions)
 
@@ -102,6 +107,11 @@ class Model:
     def groups(self) -> tuple[ParameterGroup, ...]:
         """The groups of tensors in training that are no rows of Gaussians."""
         return tuple(each for part in self.parts.values() for each in part.groups)
+
+    @property
+    def light(self) -> DirectionalLight | None:
+        """The far light that surfaces mirror, where a part has one at present."""
+        return next((light for part in self.parts.values() if (light := part.light) is not None), None)
 
     def find(self, name: str) -> GaussianSet | None:
         """The set of this name; None while there is none."""
@@ -159,6 +169,10 @@ class Model:
         frame = Frame(camera, step, mode, options, mask)
         for part in self.parts.values():
             frame = part.aim(frame)
+        return self.seen(frame)
+
+    def seen(self, frame: Frame) -> RenderedView:
+        """A view that has been aimed, rendered; :meth:`render` aims it first."""
         shaded = self._shade(frame)
         for part in self.parts.values():
             shaded = part.finish(frame, shaded)
@@ -226,3 +240,15 @@ class Model:
         self.generator.set_state(state["generator"])
         for each in (*self.sets, *self.groups):
             each.load(state)
+
+
+def photo_parts(setup: Setup) -> tuple[Poses | Exposure, ...]:
+    """What any method learns of each training photo, where its settings ask for it.
+
+    Raises:
+        RtgsError: the method cannot learn it.
+    """
+    settings = setup.settings
+    setup.spec.refuse_poses(settings)
+    asked = ((settings.poses.enabled, Poses), (settings.appearance.enabled, Exposure))
+    return tuple(kind(setup) for enabled, kind in asked if enabled)

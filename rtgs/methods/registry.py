@@ -2,7 +2,9 @@
 
 Without torch. ``method.name`` is one of
 
-- ``2dgs``, ``3dgs``, ``envgs``, ``rtgs``, ``rtgs_printed``: of this package;
+- ``2dgs``, ``3dgs``, ``3dgs_dr``, ``gaussian_shader``, ``ref_gaussian``, ``ref_gs``, ``envgs``, ``rtgs``,
+  ``rtgs_printed``: of this package;
+- ``external``: pictures of another program, nothing is trained;
 - a name that an installed package declares as an entry point of the group ``rtgs.methods``;
 - ``package.module:ATTRIBUTE``, any importable :class:`~rtgs.methods.spec.MethodSpec`.
 """
@@ -13,21 +15,43 @@ import difflib
 import importlib
 from importlib import metadata
 
-from rtgs.methods import envgs, gs2d, gs3d, rtgs, rtgs_printed
+from rtgs.methods import (
+    envgs,
+    external,
+    gaussian_shader,
+    gs2d,
+    gs3d,
+    gs3d_dr,
+    ref_gaussian,
+    ref_gs,
+    rtgs,
+    rtgs_printed,
+)
 from rtgs.methods.spec import MethodSpec
 
 ENTRY_POINTS = "rtgs.methods"
 REACHES = ()  # by name only what others install: the digest of its source is in the recipe of its steps
-_OWN = {spec.name: spec for spec in (gs2d.SPEC, gs3d.SPEC, envgs.SPEC, rtgs.SPEC, rtgs_printed.SPEC)}
+_SPECS = (
+    gs2d.SPEC,
+    gs3d.SPEC,
+    gs3d_dr.SPEC,
+    gaussian_shader.SPEC,
+    ref_gaussian.SPEC,
+    ref_gs.SPEC,
+    envgs.SPEC,
+    rtgs.SPEC,
+    rtgs_printed.SPEC,
+)
+_OWN = {spec.name: spec for spec in _SPECS}
 
 
 def method_names() -> tuple[str, ...]:
-    """The names that need no place: those of this package, then those of installed ones."""
+    """The names of what trains and needs no place: those of this package, then those of installed ones."""
     return (*_OWN, *sorted(set(_entry_points()) - set(_OWN)))
 
 
 def own_methods() -> tuple[MethodSpec, ...]:
-    """The methods of this package."""
+    """The methods of this package that train."""
     return tuple(_OWN.values())
 
 
@@ -39,9 +63,11 @@ def find_method(name: str) -> MethodSpec:
     """
     if name in _OWN:
         return _OWN[name]
+    if name == external.SPEC.name:
+        return external.SPEC
     place = name if ":" in name else _entry_points().get(name, "")
     if not place:
-        names = method_names()
+        names = (*method_names(), external.SPEC.name)
         close = difflib.get_close_matches(name, names, n=1)
         hint = f"; did you mean {close[0]}?" if close else ""
         raise ValueError(

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from rtgs.methods.family import DIFFUSE, REFLECTION, TRANSMITTANCE
-from rtgs.methods.spec import BEYOND_PAPER, GLASS, MICROFACET, MIRROR, SURFACE, MethodSpec
+from rtgs.methods.spec import BEYOND_PAPER, GLASS, HARMONICS, MICROFACET, MIRROR, SURFACE, MethodSpec
 
 if TYPE_CHECKING:
     from rtgs.methods.model import Model
@@ -39,5 +39,5 @@ def build(setup: Setup) -> Model:
     return Model(setup, (base, mirror, glass), terms)
 
 
-_HAS = frozenset({SURFACE, MIRROR, MICROFACET, GLASS, BEYOND_PAPER})
+_HAS = frozenset({HARMONICS, SURFACE, MIRROR, MICROFACET, GLASS, BEYOND_PAPER})
 SPEC = MethodSpec("rtgs", (DIFFUSE, REFLECTION, TRANSMITTANCE), build, _HAS)

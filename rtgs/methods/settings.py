@@ -13,6 +13,8 @@ from rtgs.core.errors import RtgsError
 from rtgs.core.recipe import UNLESS, UNLESS_DEFAULT
 from rtgs.core.refuse import refuse_bad_counts, refuse_bad_numbers, refuse_outside, refuse_unknown_words, refuse_unless
 from rtgs.gaussians.settings import DensitySettings, InitSettings, MaterialSettings, OptimizerSettings
+from rtgs.light.settings import EnvironmentSettings
+from rtgs.methods.photo_settings import AppearanceSettings, PoseSettings
 from rtgs.optics.settings import OpticsSettings, WallSettings
 from rtgs.render.settings import RenderSettings
 from rtgs.train.settings import LossSettings, ScheduleSettings
@@ -104,10 +106,14 @@ class ReflectionSettings:
     # EnvGS's boxes reach 3.8 (spheres), 2.7 (toycar), 4.2 and 1.9 (sedan) extents.
     box_reach: float = 2.0
     box_half: float = 0.0  # half side of a cube around the origin; 0 = box of the points (EnvGS: 20 for two scenes)
+    # "box": random points as above; "base": a copy of the base set as it is then (MaterialRefGS), the most opaque ones
+    # where density.max_surfels allows fewer. Nothing is where the base set has nothing: a sky, a ceiling.
+    init_from: Literal["box", "base"] = field(default="box", metadata=UNLESS_DEFAULT)
     # Colours the set starts with, and what rays see that leave it: "random", "black" (EnvGS), or of the training images
     # the "mean" or what a tenth of the pixels exceed ("bright"). Where they are darker than a sky, k_s falls there.
+    # Rays may also see a "cubemap" that learns: ``method.environment``.
     init_color: Literal["random", "mean", "bright"] = "random"
-    background: Literal["black", "mean", "bright"] = "black"
+    background: Literal["black", "mean", "bright", "cubemap"] = "black"
     offset: float = 1e-4  # of the mirror ray's start, times the extent (method.md 6.3; EnvGS 0)
     smallest_alpha: float = 1e-2  # pixels with less coverage have no surface to reflect at
     rebuild_every: int = 100  # steps between new trees; in between the tree is refitted (docs/tracer.md)
@@ -316,6 +322,14 @@ class MethodSettings:
     optics: OpticsSettings = field(default_factory=OpticsSettings)
     reflection: ReflectionSettings = field(default_factory=ReflectionSettings)
     transmittance: TransmittanceSettings = field(default_factory=TransmittanceSettings)  # of rtgs
+    appearance: AppearanceSettings = field(
+        default_factory=AppearanceSettings, metadata={"recipe": "unless", "value": AppearanceSettings()}
+    )
+    poses: PoseSettings = field(default_factory=PoseSettings, metadata={"recipe": "unless", "value": PoseSettings()})
+    # Of methods with a cubemap of what is far away.
+    environment: EnvironmentSettings = field(
+        default_factory=EnvironmentSettings, metadata={"recipe": "unless", "value": EnvironmentSettings()}
+    )
     paper_schedule: ScheduleSettings = field(default_factory=ScheduleSettings)  # preset=paper takes this one
     # Numbers that only this method has: :attr:`rtgs.methods.spec.MethodSpec.own` says which, and checks them.
     own: dict[str, Any] = field(default_factory=dict, metadata={"recipe": "unless", "value": {}})

@@ -24,12 +24,14 @@ if TYPE_CHECKING:
     from rtgs.scenes.scene import Scene
     from rtgs.train.settings import ScheduleSettings
 
+HARMONICS = "harmonics"  # colours of its Gaussians that turn with the view: SH above degree 0
 SURFACE = "surface"  # Gaussians with a normal and a depth: losses on surfaces, meshes
 MIRROR = "mirror"  # reflected light of its own
 MICROFACET = "microfacet"  # a weight of reflected light that follows from roughness and reflectance
 GLASS = "glass"  # a stage for what is seen through transparent objects
 BEYOND_PAPER = "beyond_paper"  # what rtgs adds to the paper: glass on a mesh of its own, lit by physics; first values
-FEATURES = (SURFACE, MIRROR, MICROFACET, GLASS, BEYOND_PAPER)
+RASTERIZED = "rasterized"  # rasterised Gaussians and nothing else: no ray starts from a pixel
+FEATURES = (HARMONICS, SURFACE, MIRROR, MICROFACET, GLASS, BEYOND_PAPER, RASTERIZED)
 
 StartOf = Callable[["MethodSettings", "ScheduleSettings"], int]
 Reads = Callable[["MethodSettings"], "MethodSettings"]
@@ -111,6 +113,7 @@ class MethodSpec:
         has: which of :data:`FEATURES` it has. Ablations say what they take away, and are refused by methods without it.
         own: a frozen dataclass of plain values, the settings that only this method has: keys ``method.own.<field>``.
             None: there are none.
+        elsewhere: its pictures are another program's: it has no stages, and nothing is trained.
     """
 
     name: str
@@ -118,8 +121,13 @@ class MethodSpec:
     build: Callable[[Setup], Method]
     has: frozenset[str] = frozenset()
     own: type | None = None
+    elsewhere: bool = False
 
     def __post_init__(self) -> None:
+        if self.elsewhere:
+            if self.stages:
+                raise ValueError(f"method {self.name!r}: its pictures come from elsewhere, so it has no stages")
+            return
         first = self.stages[0] if self.stages else None
         if first is None or first.start is not at_once or first.on is not always or first.needs_object:
             raise ValueError(f"method {self.name!r}: its first stage must start at once, in every scene (step 0)")
@@ -144,6 +152,21 @@ class MethodSpec:
             return None
         return build_checked(self.own, settings.own, "method.own")
 
+    def refuse_poses(self, settings: MethodSettings, asked: str = "") -> None:
+        """Poses of cameras are learned from what is rasterised; rays give no gradient of them.
+
+        ``asked``: a key with its value that asks for it as ``method.poses.enabled`` does.
+
+        Raises:
+            RtgsError: they are to be learned, and the method is more than :data:`RASTERIZED`.
+        """
+        if (asked or settings.poses.enabled) and RASTERIZED not in self.has:
+            raise RtgsError(
+                f"{asked or 'method.poses.enabled=true'}, but method {self.name} is not {RASTERIZED!r} alone: the rays "
+                "that it traces from its pixels give no gradient of the camera. Leave it out, or train method=2dgs or "
+                "3dgs"
+            )
+
     def stage(self, name: str) -> StageSpec:
         """The stage of this name.
 
@@ -167,6 +190,8 @@ class MethodSpec:
         among them.
         """
         weights = {name: getattr(settings.loss, name) for name in LOSS_WEIGHTS}
+        if self.elsewhere:
+            return ()
         return tuple(
             Decision(f"method.loss.{name}={weight:g} has no effect", self._why_unread(name, settings))
             for name, weight in weights.items()

@@ -8,8 +8,11 @@ set(RTGS_KERNELS
   optimizer/adam.cpp
   image/mirror.cpp
   image/srgb.cpp
+  light/lookup.cpp
+  light/filter.cpp
   raster/surfel_project.cpp
   raster/surfel_project_backward.cpp
+  raster/surfel_wide_scales.cpp
   raster/bins.cpp
   raster/forward.cpp
   raster/backward.cpp
@@ -25,11 +28,15 @@ set(RTGS_KERNELS
 set(RTGS_BINDINGS
   bind/module.cpp
   common/isa.cpp
+  common/memory.cpp
+  common/threads.cpp
   bind/image.cpp
   bind/activation.cpp
   bind/optimizer.cpp
   bind/mirror.cpp
   bind/srgb.cpp
+  light/border.cpp
+  bind/light.cpp
   bind/raster.cpp
   bind/ellipsoids.cpp
   trace/bvh_tree.cpp
@@ -43,12 +50,26 @@ if(CMAKE_SYSTEM_PROCESSOR MATCHES "x86_64|AMD64")
   set(RTGS_FLAGS_avx512 -march=x86-64-v4 -mprefer-vector-width=512)
 endif()
 
+# For `make sanitize`: every error of memory and every undefined operation ends the process with a report.
+option(RTGS_SANITIZE "with the sanitizers of addresses and of undefined behaviour" OFF)
+set(RTGS_OPTIMIZE -O3)
+set(RTGS_SANITIZERS "")
+if(RTGS_SANITIZE)
+  set(RTGS_OPTIMIZE -O2)
+  set(RTGS_SANITIZERS -fsanitize=address,undefined -fno-sanitize-recover=all -fno-omit-frame-pointer -g1)
+endif()
+
 nanobind_add_module(_core NB_STATIC)
 list(TRANSFORM RTGS_KERNELS PREPEND ${RTGS_NATIVE}/)
 list(TRANSFORM RTGS_BINDINGS PREPEND ${RTGS_NATIVE}/)
 target_sources(_core PRIVATE ${RTGS_BINDINGS})
 target_include_directories(_core PRIVATE ${RTGS_NATIVE})
 target_link_libraries(_core PRIVATE OpenMP::OpenMP_CXX)
+target_compile_options(_core PRIVATE ${RTGS_SANITIZERS})
+target_link_options(_core PRIVATE ${RTGS_SANITIZERS})
+if(RTGS_SANITIZE)
+  target_compile_definitions(_core PRIVATE RTGS_SANITIZE=1 _GLIBCXX_ASSERTIONS=1)
+endif()
 
 foreach(isa ${RTGS_ISAS})
   set(objects rtgs_kernels_${isa})
@@ -56,7 +77,8 @@ foreach(isa ${RTGS_ISAS})
   target_include_directories(${objects} PRIVATE ${RTGS_NATIVE})
   target_compile_definitions(${objects} PRIVATE RTGS_ISA=${isa} RTGS_ISA_${isa}=1)
   # fast-math when compiling only: linking with it would set flush-to-zero for the whole Python process.
-  target_compile_options(${objects} PRIVATE -O3 -ffast-math -fno-finite-math-only -Wno-psabi ${RTGS_FLAGS_${isa}})
+  target_compile_options(${objects} PRIVATE ${RTGS_OPTIMIZE} -ffast-math -fno-finite-math-only -Wno-psabi
+                         ${RTGS_FLAGS_${isa}} ${RTGS_SANITIZERS})
   target_link_libraries(${objects} PRIVATE OpenMP::OpenMP_CXX)
   target_sources(_core PRIVATE $<TARGET_OBJECTS:${objects}>)
   target_compile_definitions(_core PRIVATE RTGS_HAS_${isa}=1)

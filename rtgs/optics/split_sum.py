@@ -16,6 +16,7 @@ SIDE = 48  # cells of the table along cosine and width
 SAMPLES = 512  # directions of one entry
 WIDEST = 1.63  # the largest width the table knows: g(1) = 1.62142
 SMALLEST_COSINE = 1e-3
+SMALLEST_ROUGHNESS = 1e-3  # below it the square root that the table is placed by has no gradient
 
 
 def split_sum_factors(cosine: Tensor, width: Tensor) -> tuple[Tensor, Tensor]:
@@ -30,6 +31,20 @@ def split_sum_factors(cosine: Tensor, width: Tensor) -> tuple[Tensor, Tensor]:
     top = torch.lerp(table[index], table[index + 1], across[..., None])
     bottom = torch.lerp(table[index + SIDE], table[index + SIDE + 1], across[..., None])
     return tuple(torch.lerp(top, bottom, down[..., None]).unbind(-1))  # type: ignore[return-value]
+
+
+def split_sum_weight(cosine: Tensor, roughness: Tensor, reflectance: Tensor) -> Tensor:
+    """(C, P) reflectance A + B of P lobes (Karis 2013): what a light of one colour around them is multiplied with.
+
+    Args:
+        cosine: (P,) n . omega_o; outside 0..1 it counts as the end.
+        roughness: (P,) in 0..1, at least 0.001 counts; the width of the lobe is its square.
+        reflectance: (C, P) at normal incidence.
+
+    Differentiable in all, any dtype.
+    """
+    scale, offset = split_sum_factors(cosine, roughness.clamp_min(SMALLEST_ROUGHNESS).square())
+    return reflectance * scale + offset
 
 
 def _place(share: Tensor) -> tuple[Tensor, Tensor]:

@@ -40,7 +40,8 @@ class Network:
             import onnxruntime
         except ImportError as error:
             raise PrepareError(
-                f"{path.name} needs the package onnxruntime: pip install 'rtgs[prepare]', or bring the maps yourself"
+                f"{path.name} needs the package onnxruntime: pip install -e '.[prepare]' in the clone of rtgs, or "
+                "bring the maps yourself"
             ) from error
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rtgs.prepare.errors import PrepareError
+from rtgs.prepare.masks.drawn import read_drawing
+from rtgs.prepare.masks.settings import MaskSettings
 from rtgs.prepare.poses.find import Request, check_count, ignored_folders
 from rtgs.prepare.poses.photos import VIDEO_SUFFIXES, find_photo_folder, photo_files, read_photo_set
 from rtgs.prepare.settings import SfmSettings
@@ -14,8 +16,9 @@ from rtgs.scenes.capture import Finding, list_some
 from rtgs.scenes.check import check_capture
 from rtgs.scenes.digest import files_digest
 from rtgs.scenes.importers.colmap import incomplete_model
-from rtgs.scenes.importers.registry import EMBEDDED_PREFIX, capture_root, detect_format, find_format
+from rtgs.scenes.importers.registry import EMBEDDED_PREFIX, capture_root, detect_format, find_format, read_capture
 from rtgs.scenes.settings import CaptureError, SceneSettings
+from rtgs.scenes.splits import select_views
 
 
 @dataclass(frozen=True)
@@ -87,13 +90,49 @@ def _without_poses(root: Path, scene: SceneSettings) -> Source:
     raise PrepareError(f"{root} holds no photos to look for poses in: correct scene.path, or set sfm.use=auto")
 
 
-def check_source(scene: SceneSettings, sfm: SfmSettings) -> list[Finding]:
-    """What is wrong with a capture, with poses or without, errors first; opens every photo."""
+def check_source(scene: SceneSettings, sfm: SfmSettings, masks: MaskSettings | None = None) -> list[Finding]:
+    """What is wrong with a capture, with poses or without, errors first; opens every photo. ``masks``: with the file of
+    marks that it names, where it is there."""
     try:
         source = find_source(scene, sfm)
     except (CaptureError, PrepareError) as error:
         return [Finding("error", str(error), scene.path)]
-    return check_capture(scene) if source.has_poses else _check_without_poses(source, scene, sfm)
+    found = check_capture(scene) if source.has_poses else _check_without_poses(source, scene, sfm)
+    if masks is None or masks.source == "none" or any(finding.severity == "error" for finding in found):
+        return found
+    return [*_check_marks(source, scene, masks), *found]
+
+
+def mark_file(source: Source, masks: MaskSettings) -> Path:
+    """Where marks of this capture are, if there are any."""
+    return (source.path if source.path.is_dir() else source.path.parent) / masks.drawn.file
+
+
+def markable_names(source: Source, scene: SceneSettings) -> tuple[str, ...] | None:
+    """The photos that a file of marks may name; None of a video, whose frames are chosen later. Opens headers of photos
+    without poses.
+
+    Raises:
+        CaptureError: the capture cannot be read.
+        PrepareError: there are no photos that can be.
+    """
+    if source.kind == "video":
+        return None
+    if not source.has_poses:
+        return read_photo_set(source.path, scene.images_dir).names
+    return tuple(view.name for view in select_views(read_capture(scene), scene))
+
+
+def _check_marks(source: Source, scene: SceneSettings, masks: MaskSettings) -> list[Finding]:
+    """Problems of the file of marks: each would come up hours later, when poses are known."""
+    file = mark_file(source, masks)
+    if not file.is_file():
+        return []
+    try:
+        marked = read_drawing(file, markable_names(source, scene)).marked
+    except (PrepareError, CaptureError) as error:
+        return [Finding("error", str(error), str(file))]
+    return [Finding("info", f"marks in {len(marked)} photos ({list_some(marked, 4)})", str(file))]
 
 
 def _check_without_poses(source: Source, scene: SceneSettings, sfm: SfmSettings) -> list[Finding]:

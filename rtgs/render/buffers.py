@@ -17,6 +17,8 @@ class RasterOptions:
     far: float = 100.0  # world units: only the distortion's depth mapping uses it
     transmittance_cutoff: float = 1e-4  # a pixel stops after the surfel that takes T below it
     alpha_cutoff: float = 1 / 255  # a contribution with less alpha is skipped; it also bounds a surfel's support
+    low_pass: float = 0.5  # px^2, variance of the disc below which no footprint shrinks (2DGS)
+    convolved: bool = False  # footprints are convolved with a Gaussian of variance low_pass instead, energy kept
     depth: bool = False
     median_depth: bool = False
     normal: bool = False

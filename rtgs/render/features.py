@@ -68,12 +68,12 @@ class FeatureLayout:
 def feature_layout(gaussians: Gaussians, *, normals: bool = False) -> FeatureLayout:
     """Colour, the channels as declared, and the normal last where ``normals``.
 
-    The residual of a normal is no part of its own: it acts in the normal.
+    The residual of a normal is no part of its own: it acts in the normal. Nor are channels that are not composited.
 
     Raises:
         ValueError: more than 32 columns in all.
     """
-    channels = [channel for channel in gaussians.channels if channel.name != NORMAL_RESIDUAL]
+    channels = [each for each in gaussians.channels if each.composited and each.name != NORMAL_RESIDUAL]
     last = ((NORMAL, 3),) if normals else ()
     parts = ((COLOR, COLOR_COLUMNS), *((channel.name, channel.columns) for channel in channels), *last)
     return FeatureLayout(tuple(name for name, _ in parts), tuple(count for _, count in parts))

@@ -11,12 +11,12 @@ from rtgs.native import core
 
 
 def native_camera(
-    camera: Camera, near: float, far: float, cutoffs: tuple[float, float] = (1 / 255, 1e-4)
+    camera: Camera, near: float, far: float, cutoffs: tuple[float, float] = (1 / 255, 1e-4), low_pass: float = 0.5
 ) -> core.RasterCamera:
-    """Pose, intrinsics and planes (world units) of one view, and the cutoffs of alpha and transmittance."""
-    c = camera
+    """Pose, intrinsics and planes (world units) of one view, cutoffs of alpha and transmittance, low-pass (px^2)."""
+    c, cuts = camera, (*cutoffs, low_pass)
     rotation, translation = c.rotation.contiguous().numpy(), c.translation.contiguous().numpy()
-    return core.RasterCamera(rotation, translation, c.fx, c.fy, c.cx, c.cy, c.width, c.height, near, far, *cutoffs)
+    return core.RasterCamera(rotation, translation, c.fx, c.fy, c.cx, c.cy, c.width, c.height, near, far, *cuts)
 
 
 def as_array(tensor: Tensor | None) -> np.ndarray | None:

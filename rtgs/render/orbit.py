@@ -77,7 +77,9 @@ def orbit_of_cameras(cameras: Sequence[Camera]) -> Orbit:
         raise ValueError(f"{len(cameras)} cameras; an orbit needs at least 2")
     centers = torch.stack([camera.center for camera in cameras])
     axes = torch.stack([camera.rotation[2] for camera in cameras])
-    up = _unit(-torch.stack([camera.rotation[1] for camera in cameras]).mean(dim=0))
+    ups = -torch.stack([camera.rotation[1] for camera in cameras])
+    mean_up = ups.mean(dim=0)
+    up = _unit(mean_up if float(mean_up.norm()) > 1e-3 else ups[0])  # half of a capture upside down: none prevails
     across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]
     # The point nearest to all optical axes; a little weight on the mean centre keeps parallel axes solvable.
     damping = 1e-3 * torch.eye(3, dtype=torch.float64)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -13,6 +14,7 @@ from rtgs.native import core
 from rtgs.render.arguments import check_float32, check_shapes, check_size
 from rtgs.render.buffers import RasterBuffers, RasterOptions
 from rtgs.render.native_call import as_array, empty_if, native_camera
+from rtgs.render.surfel_filter import convolve_surfels, rasterize_convolved
 
 _DEFAULT_OPTIONS = RasterOptions()
 
@@ -76,6 +78,10 @@ def rasterize_surfels(
     named |= {"features": features, "background": background, "screen_probe": screen_probe}
     check_float32(named, "rtgs.render.reference.surfels")
     _check_options(options, camera)
+    if options.convolved:
+        surfels = (means, tangent_u, tangent_v, scales, opacities)
+        seen = (features, camera, background, options, screen_probe)
+        return rasterize_convolved(rasterize_surfels, convolve_surfels, surfels, *seen)
     if background is not None:
         background = background.detach().contiguous()
     call = _Call(camera, options, background, torch.get_num_threads())
@@ -109,7 +115,7 @@ class _Rasterize(torch.autograd.Function):
         arrays = [as_array(t) for t in (means, tangent_u, tangent_v, scales, opacities, features)]
         needs_depth = options.depth or options.median_depth or options.distortion
         cutoffs = (options.alpha_cutoff, options.transmittance_cutoff)
-        camera = native_camera(call.camera, options.near, options.far, cutoffs)
+        camera = native_camera(call.camera, options.near, options.far, cutoffs, options.low_pass)
         native = core.Rasterization(camera, options.normal, needs_depth)
         native.project(*arrays, call.threads)
 
@@ -168,4 +174,6 @@ def _check_options(options: RasterOptions, camera: Camera) -> None:
     for name in ("alpha_cutoff", "transmittance_cutoff"):
         if not 0 < getattr(options, name) < 0.99:
             raise ValueError(f"{name}={getattr(options, name)} must be above 0 and below 0.99, the largest alpha")
+    if not 0 < options.low_pass < math.inf:
+        raise ValueError(f"low_pass={options.low_pass} must be positive and finite (px^2)")
     check_size(camera)

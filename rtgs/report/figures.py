@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import html
 import io
 import math
 from collections.abc import Sequence
@@ -20,6 +21,8 @@ from rtgs.mesh.triangles import TriangleMesh
 DEPTH_COLORMAP = "turbo"
 MASK_COLOR = (60, 220, 230)  # cyan: no colour of the error map
 _ROUNDS = ("-", "--", ":")  # lines of curves that share a colour
+_LEGEND_ROW = 0.17  # inches
+_FEW_DECADES = 1.5  # of a logarithmic axis, below which 2 and 5 are labelled as well
 _LEGEND_WIDTH, _LEGEND_HANDLE = 72, 5  # characters of a legend's row; a line and its gaps take as much as so many
 COVERED = 0.5  # alpha from which a pixel counts when the depth range is chosen
 DEPTH_QUANTILES = (0.02, 0.98)
@@ -50,11 +53,13 @@ class DepthPicture:
     far: float
 
 
-def depth_picture(depth: Tensor, alpha: Tensor | None = None) -> DepthPicture | None:
+def depth_picture(
+    depth: Tensor, alpha: Tensor | None = None, limits: tuple[float, float] | None = None
+) -> DepthPicture | None:
     """Turbo colours over disparity, near warm and far cold; pixels with alpha below one half stay grey.
 
-    ``depth`` (H, W) is z-depth of the surface (already divided by alpha). The range is the 2nd to 98th percentile of
-    the covered pixels. None when no pixel is covered.
+    ``depth`` (H, W) is z-depth of the surface (already divided by alpha). The range is ``limits``, near and far in
+    world units; None: the 2nd to 98th percentile of the covered pixels. None when no pixel is covered.
     """
     depth = depth.detach().double()
     covered = torch.isfinite(depth) & (depth > 0)
@@ -62,8 +67,7 @@ def depth_picture(depth: Tensor, alpha: Tensor | None = None) -> DepthPicture | 
         covered &= alpha >= COVERED
     if not covered.any():
         return None
-    values = depth[covered].numpy()
-    near, far = (float(value) for value in np.quantile(values, DEPTH_QUANTILES))
+    near, far = limits or tuple(float(each) for each in np.quantile(depth[covered].numpy(), DEPTH_QUANTILES))
     if not far > near * (1 + 1e-6):
         near, far = near * 0.99, far * 1.01
     disparity = torch.where(covered, 1 / depth.clamp_min(1e-12), torch.nan)
@@ -154,7 +158,9 @@ def curve_svg(curves: Sequence[Curve], *, label: str, log: bool = False) -> str:
         matplotlib.rcParams["svg.hashsalt"] = label
         matplotlib.rcParams["font.family"] = "sans-serif"
         matplotlib.rcParams["font.size"] = 8.5
-        figure = Figure(figsize=(4.1, 2.5), layout="constrained")
+        names = [curve.name for curve in drawable]
+        rows = math.ceil(len(names) / _legend_columns(names)) if len(names) > 1 else 0
+        figure = Figure(figsize=(4.1, 2.5 + _LEGEND_ROW * rows), layout="constrained")
         figure.patch.set_alpha(0)
         axes = figure.add_subplot()
         for index, curve in enumerate(drawable):
@@ -165,24 +171,26 @@ def curve_svg(curves: Sequence[Curve], *, label: str, log: bool = False) -> str:
             axes.plot(curve.steps, values, style, color=color, lw=1.5, marker=marker, ms=3.5, label=curve.name)
         _style(axes, label, log)
         if len(drawable) > 1:
-            axes.legend(
+            figure.legend(
                 frameon=False,
                 labelcolor=_INK,
                 fontsize=7.5,
                 handlelength=1.0,
                 handletextpad=0.5,
-                ncols=_legend_columns([curve.name for curve in drawable]),
+                ncols=_legend_columns(names),
                 columnspacing=0.9,
-                loc="lower right",
-                bbox_to_anchor=(1, 0.98),
-                borderaxespad=0,
+                loc="outside lower left",
             )
         buffer = io.StringIO()
         no_metadata = dict.fromkeys(("Date", "Creator", "Format", "Type"))  # RDF, full of addresses
         figure.savefig(buffer, format="svg", metadata=no_metadata, transparent=True)
     svg = buffer.getvalue()
     svg = svg[svg.index("<svg") :]
-    return svg.replace(_INK, "var(--ink-soft)").replace(_GRID, "var(--line)")
+    svg = svg.replace(_INK, "var(--ink-soft)").replace(_GRID, "var(--line)")
+    about = (
+        f"{label} over the training step: {', '.join(names)}" if len(names) > 1 else f"{label} over the training step"
+    )
+    return svg.replace("<svg ", f'<svg role="img" aria-label="{html.escape(about)}" ', 1)
 
 
 def _legend_columns(names: Sequence[str]) -> int:
@@ -201,7 +209,10 @@ def _style(axes, label: str, log: bool) -> None:
 
     if log:
         axes.set_yscale("log")
-        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        low, high = axes.get_ylim()
+        decades = math.log10(high / low)
+        subs = (1.0, 2.0, 5.0) if decades < _FEW_DECADES else (1.0,)  # labels keep apart
+        axes.yaxis.set_major_locator(LogLocator(subs=subs, numticks=8))
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.4g}"))
         axes.yaxis.set_minor_locator(NullLocator())
     else:

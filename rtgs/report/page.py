@@ -30,6 +30,7 @@ from rtgs.report.figures import (
     normal_picture,
     outlined,
 )
+from rtgs.report.files import BEGIN, END
 from rtgs.report.layers import layer_pixels
 from rtgs.scenes.truth import ViewTruth
 
@@ -108,6 +109,8 @@ class ReportData:
     config: tuple[ConfigLine, ...] = ()
     machine: Mapping[str, str] = field(default_factory=dict)  # processor, cores, threads, instruction set, versions
     mesh: MeshFigure | None = None
+    preview: str = ""  # address of a moving picture; empty: none
+    environment: np.ndarray | None = None  # (H, 2 H, 3) uint8, all directions: the far light that surfaces mirror
     timed: str = "per view"  # what the time of rendering is of
 
 
@@ -205,6 +208,8 @@ def render_report(data: ReportData) -> str:
         reasons=_reasons(data.evaluation),
         panels=panels,
         mesh=mesh,
+        environment=_environment_picture(data.environment),
+        files=Markup(BEGIN + END),
         picture_note=picture_note,
         charts=[Markup(svg) for svg in _charts(data.curves) if svg],
     )
@@ -228,6 +233,8 @@ _ALWAYS = (
     Column("flip", "FLIP", 4),
 )
 _WHEN_PRESENT = (
+    Column("cc_psnr", "PSNR after a colour fit", 2),
+    Column("psnr_refined_poses", "PSNR from refined poses", 2),
     Column("psnr_masked", "PSNR in mask", 2),
     Column("ssim_masked", "SSIM in mask", 4),
     Column("lpips_01_masked", "LPIPS [0,1] in mask", 4),
@@ -387,6 +394,13 @@ def _mesh_picture(mesh: MeshFigure | None, long_side: int, quality: int) -> Pict
         return None
     label = Picture("", "Mesh", f"{mesh.vertices:,} vertices, {mesh.faces:,} triangles. {mesh.note}".strip())
     return _encoded(mesh.pixels, label, long_side, quality)
+
+
+def _environment_picture(panorama: np.ndarray | None) -> Picture | None:
+    if panorama is None:
+        return None
+    caption = "All directions, as the model mirrors them. Up is that of the cameras; the middle is ahead of the first."
+    return _encoded(panorama, Picture("", "Environment", caption), *PICTURE_STEPS[0])
 
 
 def _size(panel: ViewPanel) -> int:

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError
@@ -14,9 +17,12 @@ from torch import Tensor
 from rtgs.core.cameras import Camera
 from rtgs.core.documents import load_json
 from rtgs.core.names import path_inside
+from rtgs.core.records import record_of
+from rtgs.core.refuse import cut, shown
 from rtgs.scenes.scene import Scene, View
 from rtgs.scenes.settings import CaptureError
 from rtgs.scenes.truth import ViewTruth
+from rtgs.scenes.undistort import Lens, check_lens
 
 FORMAT_VERSION = 1
 SCENE_FILE = "scene.json"
@@ -65,6 +71,7 @@ def save_scene(scene: Scene, folder: Path) -> None:
         "name": scene.name,
         "extent": scene.extent,
         "source": scene.source,
+        **({} if scene.noise_psnr is None else {"noise_psnr": scene.noise_psnr}),
         **entries,
     }
     (folder / SCENE_FILE).write_text(json.dumps(content, indent=1), encoding="utf-8")
@@ -85,21 +92,25 @@ def read_scene(folder: Path) -> Scene:
                 f"scene {folder} has format version {version}, this rtgs reads {FORMAT_VERSION}: import again"
             )
         cloud = load_file(folder / POINTS_FILE)
+        extent = content["extent"]
+        if not isinstance(extent, float | int) or not 0 < extent < math.inf:
+            raise ValueError(f"extent is {shown(extent)}")
         return Scene(
             name=content["name"],
-            train=tuple(_view(folder, _ViewEntry(**entry)) for entry in content["train"]),
-            test=tuple(_view(folder, _ViewEntry(**entry)) for entry in content["test"]),
+            train=_views(folder, content["train"]),
+            test=_views(folder, content["test"]),
             points=cloud["points"],
             point_colors=cloud["point_colors"],
-            extent=content["extent"],
+            extent=extent,
             source=content["source"],
-            held=tuple(_view(folder, _ViewEntry(**entry)) for entry in content.get("held", ())),
+            held=_views(folder, content.get("held", ())),
+            noise_psnr=content.get("noise_psnr"),
         )
     except CaptureError:
         raise
     except (OSError, ValueError, SafetensorError, LookupError, TypeError, AttributeError, RuntimeError) as error:
         raise CaptureError(
-            f"scene {folder} cannot be read ({error}): delete the folder and import the capture again"
+            f"scene {folder} cannot be read ({cut(str(error), 400)}): delete the folder and import the capture again"
         ) from error
 
 
@@ -120,6 +131,10 @@ def _entry(view: View, file: str) -> _ViewEntry:
     )
 
 
+def _views(folder: Path, entries: Sequence[Mapping[str, Any]]) -> tuple[View, ...]:
+    return tuple(_view(folder, record_of(_ViewEntry, entry, folder / SCENE_FILE)) for entry in entries)
+
+
 def _view(folder: Path, entry: _ViewEntry) -> View:
     tensors: dict[str, Tensor] = load_file(path_inside(folder, entry.file, folder / SCENE_FILE, CaptureError))
     camera = Camera(
@@ -133,6 +148,11 @@ def _view(folder: Path, entry: _ViewEntry) -> View:
         entry.height,
         name=entry.camera_name,
     )
+    numbers = (camera.fx, camera.fy, camera.cx, camera.cy)
+    if wrong := check_lens(Lens("PINHOLE", camera.width, camera.height, numbers), entry.name):
+        raise ValueError(wrong)
+    if tensors["image"].shape != (3, camera.height, camera.width):
+        raise ValueError(f"{entry.file} is of another size than the camera of {entry.name}")
     truth = {
         key.removeprefix(_TRUTH_PREFIX): tensor for key, tensor in tensors.items() if key.startswith(_TRUTH_PREFIX)
     }

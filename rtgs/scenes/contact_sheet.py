@@ -82,8 +82,8 @@ def figures(captures: list[Path]) -> str:
     """A Markdown table of the captures' records."""
     lines = [
         "| scene | stands in for | masked | specular | reflected light in the mask / on all specular surfaces "
-        "| noise of test images | points | size |",
-        "|---|---|---|---|---|---|---|---|",
+        "| noise of test images | of photos (estimated) | points | size |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
     for folder in captures:
         record = CaptureRecord.read(folder)
@@ -93,7 +93,7 @@ def figures(captures: list[Path]) -> str:
         lines.append(
             f"| {record.name} | {record.stand_in_for or '-'} | {record.masked:.0%} | {record.specular:.0%} "
             f"| {_percent(record.reflected_in_mask)} / {_percent(record.reflected_in_specular)} "
-            f"| {record.noise_psnr:.1f} dB | {record.points} | {megabytes:.1f} MB |"
+            f"| {record.noise_psnr:.1f} dB | {record.photo_noise_psnr:.1f} dB | {record.points} | {megabytes:.1f} MB |"
         )
     return "\n".join(lines)
 

@@ -13,6 +13,7 @@ from rtgs.scenes.undistort import check_lens
 _FEW_VIEWS = 8
 _FAR_CAMERA = 50.0  # times the median distance of the cameras to their median
 _FARTHEST = 1e9  # units of the capture; float32 could not tell its views apart
+_OFF_ORIGIN = 300.0  # median distances of the cameras to their median; docs/numerics.md, "Captures far from the origin"
 _FOCAL_RATIO = 4.0  # between the longest and the shortest focal length, in image widths
 
 
@@ -142,6 +143,11 @@ def _scales(capture: Capture) -> list[Finding]:
         if far:
             what = f"{len(far)} cameras stand more than {_FAR_CAMERA:g} times farther out than usual: {list_some(far)}"
             findings.append(Finding("warning", what, where, "their poses are probably wrong: remove these images"))
+        off, usual = np.linalg.norm(np.median(centers, axis=0)), max(np.median(distance), 1e-12)
+        if off > _OFF_ORIGIN * usual:
+            what = f"the cameras stand {off:.3g} from the origin, {off / usual:.0f} times their distance to each other"
+            advice = "move poses and points to the origin: single precision blurs pictures that far out"
+            findings.append(Finding("warning", what, where, advice))
     focals = [v.lens.params[0] / v.lens.width for v in views if v.lens and v.lens.model != "EQUIRECTANGULAR"]
     if focals and min(focals) > 0 and max(focals) > _FOCAL_RATIO * min(focals):
         what = f"focal lengths differ by a factor {max(focals) / min(focals):.1f} (in image widths)"

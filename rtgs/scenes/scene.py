@@ -58,6 +58,7 @@ class Scene:
     extent: float  # 1.1 x largest distance of the training cameras to their mean, world units
     source: str  # where it came from: format, split rule, origin of the points
     held: tuple[View, ...] = ()  # kept from training and testing alike: methods are compared on them
+    noise_psnr: float | None = None  # dB of the test photos against noise-free ones, mean; where that is known
 
     @property
     def has_masks(self) -> bool:
@@ -156,10 +157,20 @@ def load_scene(settings: SceneSettings) -> Scene:
         point_colors=torch.from_numpy(points.colors.astype(np.float32)),
         extent=extent,
         held=tuple(load_view(by_name[name], settings) for name in split.held),
+        noise_psnr=None if record is None else _noise_psnr(record, [by_name[name] for name in split.test], settings),
         source=f"{capture.format}; test views: {split.rule}; points: {point_source}{record.origin if record else ''}",
     )
     log.info("%s", scene.summary())
     return scene
+
+
+def _noise_psnr(record: CaptureRecord, tests: list[CaptureView], settings: SceneSettings) -> float | None:
+    """Of path-traced test photos at the size at which they were rendered; others were averaged, or are other views."""
+    size = (record.width, record.height)
+    rendered = [view.lens is not None and (view.lens.width, view.lens.height) == size for view in tests]
+    shrunk = target_size(*size, settings) != size
+    pictures = [view.image.suffix == ".png" for view in tests]  # photos for training are JPEG, and noisier
+    return record.noise_psnr if tests and all(rendered) and all(pictures) and not shrunk else None
 
 
 def _scene_points(

@@ -167,7 +167,7 @@ def undistorted_lens(lens: Lens) -> Lens:
     Raises:
         CaptureError: spherical lenses, and parameters COLMAP cannot undistort.
     """
-    import pycolmap
+    from rtgs.core.colmap import pycolmap
 
     camera = _colmap_camera(lens)
     if lens.model == "EQUIRECTANGULAR":
@@ -266,7 +266,7 @@ def undistort_nearest(image: np.ndarray, lens: Lens) -> np.ndarray:
 
 
 def _colmap_camera(lens: Lens) -> Any:
-    import pycolmap
+    from rtgs.core.colmap import pycolmap
 
     try:
         camera = pycolmap.Camera(model=lens.model, width=lens.width, height=lens.height, params=list(lens.params))

@@ -15,17 +15,21 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from filelock import FileLock, Timeout
 
+from rtgs.core.credentials import hide, redact
 from rtgs.core.errors import RtgsError
-from rtgs.track.protocol import RunInfo, Scalar, Tracker, as_uint8, identity, mark_new
+from rtgs.track.failures import ToldClient, failure
+from rtgs.track.mlflow_view import KIND_TAG, view_tags
+from rtgs.track.protocol import STEP_TAG, RunInfo, Scalar, Tracker, as_uint8, identity, mark_new
 
 if TYPE_CHECKING:
     from mlflow.tracking import MlflowClient
 
+log = logging.getLogger("rtgs.track")
 FINGERPRINT_TAG = "rtgs.fingerprint"
 LOCK_TAG = "rtgs.lock"  # name of the kernel lock that a run holds for as long as its process lives
 PARENT_TAG = "mlflow.parentRunId"  # MLflow's own: its pages fold children under it
@@ -102,6 +106,7 @@ class MlflowTracking:
         self.root = root.absolute()
         self.root.mkdir(parents=True, exist_ok=True)
         self.local = not uri
+        hide(uri)
         self.database = self.root / "mlflow.db"
         self.uri = uri or f"sqlite:///{self.database}"
         self._client: MlflowClient | None = None
@@ -109,7 +114,7 @@ class MlflowTracking:
     @property
     def place(self) -> str:
         """The database, or the server."""
-        return f"mlflow {identity(self.database) if self.local else self.uri}"
+        return f"mlflow {identity(self.database) if self.local else redact(self.uri)}"
 
     @property
     def client(self) -> MlflowClient:
@@ -123,6 +128,7 @@ class MlflowTracking:
             from mlflow.tracking import MlflowClient
 
             _quiet_logs()
+            database = self.database if self.local else None
             try:
                 with FileLock(str(self.root / "mlflow.db.init.lock")):  # two migrations at once kill each other
                     if self.local and not self.database.exists():
@@ -130,12 +136,8 @@ class MlflowTracking:
                     client = MlflowClient(tracking_uri=self.uri)
                     client.search_experiments(max_results=1)
             except Exception as error:  # of MLflow, SQLAlchemy, SQLite, or the network
-                away = f"move {self.database} away, " if self.local else ""
-                raise RtgsError(
-                    f"MLflow at {self.uri} does not answer ({type(error).__name__}: {_first_line(error)}); "
-                    f"{away}set tracking.uri, or run with tracking=off"
-                ) from error
-            self._client = client
+                raise failure(error, self.uri, database) from None
+            self._client = cast("MlflowClient", ToldClient(client, self.uri, database))
         return self._client
 
     def _make_database(self) -> None:
@@ -154,7 +156,7 @@ class MlflowTracking:
     @contextmanager
     def run(self, info: RunInfo) -> Iterator[Tracker]:
         """A new run, held by a kernel lock for as long as this process lives."""
-        experiment = self._experiment(info.experiment)
+        experiment = self._experiment(info.experiment, ranked=STEP_TAG not in info.tags)
         self._reap([experiment])
         token = secrets.token_hex(16)
         tags = {FINGERPRINT_TAG: info.fingerprint, LOCK_TAG: token, **info.tags}
@@ -162,7 +164,7 @@ class MlflowTracking:
             tags[PARENT_TAG] = info.parent
         status = "FAILED"
         with self._alive(token):  # before the run exists: there is no moment at which it has no lock
-            run_id = self.client.create_run(experiment, run_name=info.name, tags=tags).info.run_id
+            run_id = self._create(experiment, info, tags)
             tracker = MlflowTracker(self.client, run_id)
             try:
                 yield tracker
@@ -178,21 +180,32 @@ class MlflowTracking:
 
     @contextmanager
     def sweep(self, info: RunInfo) -> Iterator[Tracker]:
-        """The run that groups those of a sweep; finished from the start, so that a kill leaves nothing running."""
-        experiment = self._experiment(info.experiment)
+        """The run that groups those of a sweep; finished from the start, so that a kill leaves nothing running.
+
+        It ends when the last of those who opened it leaves.
+        """
+        experiment = self._experiment(info.experiment, ranked=True)
         with FileLock(str(self.root / "mlflow.db.sweep.lock")):  # jobs of one sweep may be processes of their own
             found = self._of(experiment, info.fingerprint)
             if found:
                 run_id = found[0].info.run_id
             else:
                 tags = {FINGERPRINT_TAG: info.fingerprint, **info.tags}
-                run_id = self.client.create_run(experiment, run_name=info.name, tags=tags).info.run_id
+                run_id = self._create(experiment, info, tags)
                 self.client.set_terminated(run_id, "FINISHED")
         tracker = MlflowTracker(self.client, run_id)
         try:
             yield tracker
         finally:
-            tracker.flush()
+            try:
+                tracker.flush()
+            finally:
+                self.client.set_terminated(run_id, "FINISHED")
+
+    def _create(self, experiment: str, info: RunInfo, tags: Mapping[str, str]) -> str:
+        """A run that began ``info.seconds_before`` ago; its id."""
+        began = int(1000 * (time.time() - info.seconds_before))
+        return self.client.create_run(experiment, start_time=began, run_name=info.name, tags=dict(tags)).info.run_id
 
     def finished(self, experiment: str, fingerprint: str) -> bool:
         """Whether a finished run of this fingerprint is recorded in this experiment."""
@@ -202,16 +215,30 @@ class MlflowTracking:
         query = f"{condition}tags.`{FINGERPRINT_TAG}` = '{fingerprint}'"
         return list(self.client.search_runs([experiment], query, max_results=1))
 
-    def _experiment(self, name: str) -> str:
+    def _experiment(self, name: str, *, ranked: bool = False) -> str:
+        """Its id, made where it is not there. ``ranked``: its runs are compared, and it carries the view for that."""
         client = self.client  # initialised before the lock below is taken: it takes the same one
         with FileLock(str(self.root / "mlflow.db.init.lock")):
             found = client.get_experiment_by_name(name)
             if found is not None and found.lifecycle_stage == "deleted":
                 client.restore_experiment(found.experiment_id)
-            if found is not None:
-                return found.experiment_id
-            location = (self.root / "mlruns").as_uri() if self.local else None
-            return client.create_experiment(name, artifact_location=location)
+            if found is None:
+                location = (self.root / "mlruns").as_uri() if self.local else None
+                tags = dict(view_tags()) if ranked else None
+                return client.create_experiment(name, artifact_location=location, tags=tags)
+            if ranked:
+                self.carry_view(found)
+            return found.experiment_id
+
+    def carry_view(self, experiment: Any) -> None:
+        """Give an experiment that was made before there was a view, or with another one, the present one; the kind of
+        it that a person chose stays."""
+        try:
+            for key, value in view_tags().items():
+                if (key != KIND_TAG and experiment.tags.get(key) != value) or key not in experiment.tags:
+                    self.client.set_experiment_tag(experiment.experiment_id, key, value)
+        except RtgsError as error:  # a server where others own the experiment: its pages show what they did before
+            log.warning("the view of experiment %s is not kept: %s", experiment.name, error)
 
     def reap(self) -> int:
         """Mark every run that says RUNNING and whose process on this machine is gone as KILLED; returns how many."""
@@ -248,10 +275,6 @@ class MlflowTracking:
             Path(lock.lock_file).unlink(missing_ok=True)
             dead += 1
         return dead
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [""])[0]
 
 
 def _quiet() -> None:

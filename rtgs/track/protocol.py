@@ -11,6 +11,8 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+STEP_TAG = "rtgs.step"
+"""On runs of single steps; those without it are variants, which are compared."""
 Scalar = str | int | float | bool | None
 
 
@@ -50,6 +52,7 @@ class RunInfo:
 
     ``fingerprint`` is that of the step, or of the last step of a variant. Unfinished runs of the same experiment whose
     process is gone are marked as killed when a new one opens. ``parent``: id of the run of the sweep it belongs to.
+    ``seconds_before``: of work that was done for it before it is opened; its duration has them.
     """
 
     experiment: str
@@ -57,6 +60,7 @@ class RunInfo:
     fingerprint: str
     tags: Mapping[str, str] = field(default_factory=dict)
     parent: str = ""
+    seconds_before: float = 0.0
 
 
 class Tracking(Protocol):

@@ -22,6 +22,8 @@ from torch import Tensor
 from rtgs.core.documents import load_json, parse_json
 from rtgs.core.errors import RtgsError
 from rtgs.core.recipe import left_out_at
+from rtgs.core.records import record_of
+from rtgs.core.refuse import cut
 from rtgs.train.settings import ScheduleSettings
 
 FORMAT = 1
@@ -146,15 +148,15 @@ def load_checkpoint(path: Path) -> Checkpoint:
                 f"checkpoint {path}: format {body['format']}, this version reads {FORMAT}; train again or use the "
                 "version of rtgs that wrote it"
             )
-        expected = body["tensors_sha256"]
-        fields = dict(body["record"])
-        fields["versions"] = tuple((name, version) for name, version in fields["versions"])
-        record = CheckpointRecord(**fields)
+        expected = str(body["tensors_sha256"])
+        record = record_of(CheckpointRecord, body["record"], record_path)
+        dict(record.versions)  # pairs
     except CheckpointError:
         raise
-    except (LookupError, TypeError, ValueError, AttributeError) as error:
+    except (RtgsError, LookupError, TypeError, ValueError, AttributeError) as error:
         raise CheckpointError(
-            f"checkpoint {path}: {RECORD_FILE} is damaged ({error}); delete this folder to go on without it"
+            f"checkpoint {path}: {RECORD_FILE} is damaged ({cut(str(error), 400)}); delete this folder to go on "
+            "without it"
         ) from error
     found = _file_digest(tensors_path)
     if found != expected:

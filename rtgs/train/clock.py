@@ -16,6 +16,9 @@ class ElapsedTime:
     def __add__(self, other: ElapsedTime) -> ElapsedTime:
         return ElapsedTime(self.wall + other.wall, self.cpu + other.cpu)
 
+    def __sub__(self, other: ElapsedTime) -> ElapsedTime:
+        return ElapsedTime(self.wall - other.wall, self.cpu - other.cpu)
+
 
 @dataclass(frozen=True)
 class Clock:
@@ -27,3 +30,7 @@ class Clock:
     def elapsed(self) -> ElapsedTime:
         """Time since the clock was made."""
         return ElapsedTime(time.monotonic() - self._wall, time.process_time() - self._cpu)
+
+    def without(self, spent: ElapsedTime) -> Clock:
+        """The clock as if it had stood still for so long."""
+        return Clock(self._wall + spent.wall, self._cpu + spent.cpu)

@@ -133,21 +133,6 @@ def surface_depth(depth: Tensor, alpha: Tensor, median_depth: Tensor | None = No
     return expected if median_depth is None or depth_ratio == 0 else torch.lerp(expected, median_depth, depth_ratio)
 
 
-def depth_normals(depth: Tensor, camera: Camera) -> Tensor:
-    """(3, H, W) unit world normals of a surface depth (H, W): N_d of :func:`normal_consistency_loss`, for pictures."""
-    right, left = torch.zeros_like(depth), torch.zeros_like(depth)
-    down, up = torch.zeros_like(depth), torch.zeros_like(depth)
-    right[1:-1, 1:-1], left[1:-1, 1:-1] = depth[1:-1, 2:], depth[1:-1, :-2]
-    down[1:-1, 1:-1], up[1:-1, 1:-1] = depth[2:, 1:-1], depth[:-2, 1:-1]
-    valid = (right + left > 1e-12) & (down + up > 1e-12)
-    slope_x = camera.fx * (right - left) / torch.where(valid, right + left, 1.0)
-    slope_y = camera.fy * (down - up) / torch.where(valid, down + up, 1.0)
-    u, v, _ = camera.camera_rays(depth.dtype).unbind(-1)
-    facing = torch.stack((slope_x, slope_y, -(1 + slope_x * u + slope_y * v)))  # times the ray it is -1
-    unit = torch.where(valid, facing / torch.linalg.vector_norm(facing, dim=0), 0.0)
-    return torch.einsum("cw,chx->whx", camera.rotation.to(depth.dtype), unit)
-
-
 def inverse_depth_weights(depth: Tensor, alpha: Tensor | None = None) -> Tensor:
     """(H, W) 1 - (d - p1) / (p99 - p1) clipped to 0..1 (EnvGS, method.md 5), no gradient.
 

@@ -48,6 +48,7 @@ class RenderOptions:
     normal: bool = False
     distortion: bool = False
     layers: bool = False  # what reflection and transmission add, of methods that have them
+    weights: bool = False  # with ``layers``: how much each of them counts
     masks: str = ""  # which pixels show a transparent object: "given", "silhouette"; "": as the settings say
 
     def plus(self, other: RenderOptions) -> RenderOptions:
@@ -75,7 +76,10 @@ class RenderedView:
       ``transparent``, bool, the pixels that got straight rays.
     - ``layers``, image = (1 - specular) diffuse + reflection + transmission where ``traced``: ``diffuse``
       C_d; ``reflection`` k_s w_r C_r and ``transmission`` k_s w_t C_t, 0 where no ray was traced; ``reflected_color``
-      C_r and ``transmitted_color`` C_t; ``specular``, ``roughness``, ``f0`` as composited; ``traced``, bool.
+      C_r and ``transmitted_color`` C_t; ``specular``, ``roughness``, ``f0`` as composited; ``traced``, bool. With
+      ``weights`` also ``reflection_weight`` k_s w_r and ``transmission_weight`` k_s w_t, (H, W), means over colours.
+      Methods that add the reflection without taking from C_d have ``base``, what is left of the image without it, and
+      ``diffuse`` is the same.
     """
 
     camera: Camera

@@ -21,29 +21,35 @@ from rtgs.gaussians.adam import Moving, move
 class Rate:
     """Learning rate of a group: constant, or exponential from ``initial`` to ``final`` over ``steps``, after a delay.
 
-    Steps count from ``start``; before it the group stands still.
+    Steps count from ``start``; before it the group stands still. Over the first ``warm_up`` of them the rate rises in a
+    straight line to what it is without.
     """
 
     initial: float
     final: float | None = None  # None: constant
     steps: int = 1  # over which it decays
     start: int = 0  # first step at which the group moves
+    warm_up: int = 0  # steps
 
     def __post_init__(self) -> None:
         values = (self.initial, self.initial if self.final is None else self.final)
         if not all(math.isfinite(value) and value > 0 for value in values):
             raise ValueError(f"learning rates {values} of a group must be finite and above 0")
-        if self.steps < 1 or self.start < 0:
-            raise ValueError(f"a rate decays over {self.steps} steps from step {self.start}: at least 1 and 0")
+        if self.steps < 1 or self.start < 0 or self.warm_up < 0:
+            raise ValueError(
+                f"a rate decays over {self.steps} steps from step {self.start}, after {self.warm_up} of warm-up: at "
+                "least 1, 0 and 0"
+            )
 
     def at(self, step: int) -> float:
         """The rate of ``step``; 0 before the group moves."""
         if step < self.start:
             return 0.0
+        rising = min((step - self.start + 1) / self.warm_up, 1.0) if self.warm_up else 1.0
         if self.final is None:
-            return self.initial
+            return rising * self.initial
         share = min((step - self.start) / self.steps, 1.0)
-        return math.exp((1 - share) * math.log(self.initial) + share * math.log(self.final))
+        return rising * math.exp((1 - share) * math.log(self.initial) + share * math.log(self.final))
 
 
 class ParameterGroup:
@@ -75,8 +81,8 @@ class ParameterGroup:
         self.steps = 0  # updates done: the t of the bias correction
         self._betas, self._eps = betas, eps
         self._values = {key: tensor.detach().clone().contiguous().requires_grad_() for key, tensor in tensors.items()}
-        self._first = {key: torch.zeros_like(tensor) for key, tensor in tensors.items()}
-        self._second = {key: torch.zeros_like(tensor) for key, tensor in tensors.items()}
+        self._first = {key: torch.zeros(tensor.shape) for key, tensor in tensors.items()}
+        self._second = {key: torch.zeros(tensor.shape) for key, tensor in tensors.items()}
 
     def __len__(self) -> int:
         return sum(tensor.numel() for tensor in self._values.values())

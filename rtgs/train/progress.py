@@ -16,6 +16,7 @@ class StepReport:
     loss: float  # running average
     psnr: float  # running average over training views, dB
     surfels: int
+    held_out: float | None = None  # of one test view when it was last looked at, dB; None: not yet
 
 
 class Progress(Protocol):
@@ -66,9 +67,10 @@ class LineProgress:
         self._shown = now
         rate = (report.step - self._first) / max(now - self._began, 1e-9)
         left = (self._total - report.step) / max(rate, 1e-9)
+        seen = "" if report.held_out is None else f", of a test view {report.held_out:.2f} dB"
         self.note(
-            f"{self._title}: step {report.step}/{self._total}  loss {report.loss:.4f}  PSNR {report.psnr:.2f} dB  "
-            f"{report.surfels:,} Gaussians  {rate:.1f} steps/s  {_clock(left)} left"
+            f"{self._title}: step {report.step}/{self._total}  loss {report.loss:.4f}  "
+            f"PSNR {report.psnr:.2f} dB{seen}  {report.surfels:,} Gaussians  {rate:.1f} steps/s  {_clock(left)} left"
         )
 
     def note(self, text: str) -> None:
@@ -108,7 +110,8 @@ class BarProgress:
             return
         rate = (report.step - self._first) / max(time.monotonic() - self._began, 1e-9)
         # fits into 80 columns
-        status = f"loss {report.loss:.3f} {report.psnr:.1f} dB {report.surfels:,} Gaussians {rate:.0f}/s"
+        seen = "" if report.held_out is None else f" test {report.held_out:.1f}"
+        status = f"loss {report.loss:.3f} {report.psnr:.1f}{seen} dB {report.surfels:,} Gaussians {rate:.0f}/s"
         self._bar.update(self._task, completed=report.step, status=status)
 
     def note(self, text: str) -> None:
@@ -116,6 +119,29 @@ class BarProgress:
 
     def close(self) -> None:
         self._bar.stop()
+
+
+class SharedProgress:
+    """Shown in two places."""
+
+    def __init__(self, first: Progress, second: Progress) -> None:
+        self._both = (first, second)
+
+    def start(self, title: str, done: int, total: int) -> None:
+        for each in self._both:
+            each.start(title, done, total)
+
+    def advance(self, report: StepReport) -> None:
+        for each in self._both:
+            each.advance(report)
+
+    def note(self, text: str) -> None:
+        for each in self._both:
+            each.note(text)
+
+    def close(self) -> None:
+        for each in self._both:
+            each.close()
 
 
 def progress_for(stream: TextIO | None = None, *, quiet: bool = False) -> Progress:

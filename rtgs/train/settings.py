@@ -5,6 +5,7 @@ Steps count from 0. A stage boundary "from" is the first step at which something
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -27,8 +28,8 @@ class LossSettings:
     move only the two that begin with the third stage, whose start they move.
     """
 
-    l1: float = 0.8
-    dssim: float = 0.2
+    l1: float = 0.8  # of the mean absolute difference
+    dssim: float = 0.2  # of 1 - SSIM
     # Where a photo is at its brightest value the image may be brighter: windows are, and the sensor stops at 1.
     clipped: bool = field(default=False, metadata=UNLESS_DEFAULT)
     normal: float = 0.05  # 2DGS 0.05; RT-GS and EnvGS 0.04
@@ -63,16 +64,50 @@ class LossSettings:
 
 
 @dataclass(frozen=True)
+class WatchSettings:
+    """When the test views are scored along a training, whose clock stands still meanwhile (docs/figures.md).
+
+    The marks count from the start of the run, over all of its stages. Without any nothing is scored.
+    """
+
+    cpu_seconds: tuple[float, ...] = ()
+    """After so many seconds of training on the CPU, all threads: at the first step that ends later."""
+    steps: tuple[int, ...] = ()
+    """After so many steps."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "cpu_seconds", tuple(float(each) for each in self.cpu_seconds))
+        object.__setattr__(self, "steps", tuple(self.steps))
+        for name in ("cpu_seconds", "steps"):
+            marks = getattr(self, name)
+            legal = all(0 < each < math.inf for each in marks) and list(marks) == sorted(set(marks))
+            refuse_unless(legal, f"watch.{name}", list(marks), "above 0 and rising")
+
+    @property
+    def on(self) -> bool:
+        """Whether anything is scored."""
+        return bool(self.cpu_seconds or self.steps)
+
+
+@dataclass(frozen=True)
 class ScheduleSettings:
     """When things happen, in steps."""
 
-    total: int = 30_000
-    sh_from: int = 0
-    sh_every: int = 1_000
-    densify_from: int = 500
-    densify_until: int = 15_000
-    densify_every: int = 100
+    total: int = 30_000  # steps of all stages together
+    sh_from: int = 0  # from here on colours gain a degree of spherical harmonics
+    sh_every: int = 1_000  # and another one after so many steps
+    densify_from: int = 500  # density control adds and removes Gaussians from here
+    densify_until: int = 15_000  # to here
+    densify_every: int = 100  # at every so many steps
     opacity_reset_every: int = 3_000  # 0 = never; only while densifying
-    means_lr_steps: int = 30_000
+    means_lr_steps: int = 30_000  # over which the learning rate of the centres falls
     evaluate_every: int = 0  # 0 = at the end only
-    checkpoint_every: int = 500
+    checkpoint_every: int = 500  # a killed run goes on from the last one
+    # Views of the first steps are shrunk by at most this factor, and grow until this share of the run (resolution.py).
+    coarse: int = field(default=1, metadata=UNLESS_DEFAULT)
+    coarse_until: float = field(default=0.5, metadata=UNLESS_DEFAULT)
+
+    def __post_init__(self) -> None:
+        refuse_unless(1 <= self.coarse <= 8, "schedule.coarse", self.coarse, "1 (no view is shrunk) to 8")
+        until = self.coarse_until
+        refuse_unless(0 < until <= 1, "schedule.coarse_until", until, "above 0 and at most 1")

@@ -5,13 +5,13 @@ from __future__ import annotations
 import hashlib
 import math
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
-from torch import Tensor
 
 from rtgs.core.decisions import Decision
 from rtgs.core.version import VERSION
@@ -29,11 +29,16 @@ from rtgs.train.checkpoint import (
 )
 from rtgs.train.clock import Clock, ElapsedTime
 from rtgs.train.guard import check_loss, diverged
+from rtgs.train.held_out import HeldOutView, psnr_of
 from rtgs.train.memory import peak_memory_mb, start_peak_memory
 from rtgs.train.method import LossValue, Method, Mode, Stage, StepEvent
+from rtgs.train.onlooker import Onlooker, TrainingStopped
 from rtgs.train.progress import Progress, SilentProgress, StepReport
+from rtgs.train.resolution import GrowingViews
 from rtgs.train.seeds import seed_for
+from rtgs.train.settings import WatchSettings
 from rtgs.train.view_order import OrderState, ViewOrder
+from rtgs.train.watch import Watch, look, why_idle
 
 REPORT_EVERY = 10  # steps between looks at the PSNR of a training view
 RECORD_EVERY = 50  # steps between batches of metrics
@@ -44,6 +49,15 @@ class Recorder(Protocol):
     """Where metrics go: any tracker of ``rtgs.track``."""
 
     def metrics(self, values: Mapping[str, float], step: int) -> None: ...
+
+
+@runtime_checkable
+class History(Recorder, Protocol):
+    """A recorder that outlives the attempt it was made in."""
+
+    def forget_after(self, step: int) -> None:
+        """Training goes on from ``step``: what an attempt before recorded of later steps did not lead to the result."""
+        ...
 
 
 class Observer(Protocol):
@@ -108,6 +122,10 @@ class Trainer:
         None: no checkpoints.
     observer : Observer, optional
         Looks at the method after every step.
+    watch : WatchSettings, optional
+        When the test views are scored along the way, for the recorder; the clock stands still meanwhile. None: never.
+    onlooker : Onlooker, optional
+        Who looks at the method while it trains, and may ask it to end.
     """
 
     def __init__(
@@ -121,6 +139,8 @@ class Trainer:
         recorder: Recorder | None = None,
         checkpoint_dir: Path | None = None,
         observer: Observer | None = None,
+        watch: WatchSettings | None = None,
+        onlooker: Onlooker | None = None,
     ) -> None:
         self.method = method
         self.scene = scene
@@ -130,8 +150,14 @@ class Trainer:
         self.recorder = recorder
         self.checkpoint_dir = checkpoint_dir
         self.observer = observer
+        self.onlooker = onlooker
+        self._idle = why_idle(watch, tested=bool(scene.test), recorded=recorder is not None)
+        self._watch = Watch(watch) if watch is not None and watch.on and not self._idle else None
+        self._growing = GrowingViews(scene.train, self.schedule)
         self._order = ViewOrder(len(scene.train), seed_for(seed, "views"))
         self._averages = RunningAverages()
+        self._held_out = HeldOutView(scene, self.schedule.total)
+        self._seen: float | None = None  # its PSNR when it was last looked at
         self._step = self.stage.from_step
         self._elapsed_before = ElapsedTime()
         self._clock = Clock()
@@ -155,11 +181,17 @@ class Trainer:
             A loss or gradient is not finite; the last checkpoint is intact.
         CheckpointError
             ``checkpoint_dir`` holds checkpoints that cannot be used.
+        TrainingStopped
+            The onlooker asked for the end; the present state is the last checkpoint.
         """
         start_peak_memory()
         resumed_from = self._resume()
         first = self._step
+        if isinstance(self.recorder, History):
+            self.recorder.forget_after(first)
         self._clock = Clock()
+        if self._watch is not None:
+            self._watch.due(first, self._elapsed_before.cpu)
         self.progress.start(self.stage.name, first, self.stage.until)
         try:
             self._announce(resumed_from)
@@ -184,7 +216,7 @@ class Trainer:
             psnr_train=self._averages.psnr if self._averages.psnr is not None else math.nan,
             psnr_test=self.evaluate() if self.scene.test else None,
             resumed_from=resumed_from,
-            decisions=self.method.decisions,
+            decisions=self._decisions,
         )
 
     def evaluate(self) -> float:
@@ -197,7 +229,7 @@ class Trainer:
         """
         with torch.no_grad():
             values = [
-                _psnr(self.method.render(view.camera, self._step, Mode.EVALUATE, mask=view.mask).image, view.image)
+                psnr_of(self.method.render(view.camera, self._step, Mode.EVALUATE, mask=view.mask).image, view.image)
                 for view in self.scene.test
             ]
         return sum(values) / len(values)
@@ -219,7 +251,7 @@ class Trainer:
     def _train_step(self) -> None:
         """Render, loss, backward, Adam, density control: one step on one view."""
         step = self._step
-        view = self.scene.train[self._order.next()]
+        view = self._growing.at(self._order.next(), step)
         rendered = self.method.render(view.camera, step, Mode.TRAIN, mask=view.mask)
         terms = self.method.losses(rendered, view, step)
         loss = check_loss(terms, self.method, step, view.name)
@@ -231,7 +263,7 @@ class Trainer:
         self._note(step + 1, events)
         self._averages.add_loss(loss)
         if step % REPORT_EVERY == 0:
-            self._averages.add_psnr(_psnr(rendered.image.detach(), view.image))
+            self._averages.add_psnr(psnr_of(rendered.image.detach(), view.image))
         self._window.append(terms.terms)
         self._step = step + 1
 
@@ -242,20 +274,51 @@ class Trainer:
     def _between_steps(self) -> None:
         """What happens every so many steps: progress, metrics, evaluation, checkpoint."""
         step, last = self._step, self._step == self.stage.until
+        if self._held_out.is_due(step) and not last:  # the end measures all test views
+            with self._off_the_clock():
+                self._seen = self._held_out.psnr(self.method, step)
         if step % REPORT_EVERY == 0 or last:
             self.progress.advance(self._report())
         if step % RECORD_EVERY == 0:
             self._flush_metrics()
         every = self.schedule.evaluate_every
         if every and step % every == 0 and self.scene.test:
-            psnr = self.evaluate()
+            with self._off_the_clock():
+                psnr = self.evaluate()
             self.progress.note(f"step {step}: {psnr:.2f} dB on {len(self.scene.test)} test views")
             if self.recorder is not None:
                 self.recorder.metrics({"test/psnr": psnr}, step)
         if self.observer is not None:
-            self.observer.look(self.method, step)
-        if self.checkpoint_dir is not None and (step % self.schedule.checkpoint_every == 0 or last):
+            with self._off_the_clock():
+                self.observer.look(self.method, step)
+        if self._watch is not None:
+            self._look(self._watch, last)
+        stopped = self.onlooker is not None and self._shown_to(self.onlooker)
+        if self.checkpoint_dir is not None and (step % self.schedule.checkpoint_every == 0 or last or stopped):
             save_checkpoint(self.checkpoint_dir, self.checkpoint())
+        if stopped and not last:
+            raise TrainingStopped(step)
+
+    def _shown_to(self, onlooker: Onlooker) -> bool:
+        """Whether somebody who looked asks for the end; that time does not count, be it a pause."""
+        with self._off_the_clock():
+            return onlooker.look(self.method, self._step)
+
+    def _look(self, watch: Watch, last: bool) -> None:
+        """Score the test views where a mark was passed, and at the end of the stage; that time does not count."""
+        cpu_seconds = (self._elapsed_before + self._clock.elapsed()).cpu
+        if watch.due(self._step, cpu_seconds) or last:
+            with self._off_the_clock():
+                values = look(self.method, self.scene.test, self._step, cpu_seconds)
+                assert self.recorder is not None
+                self.recorder.metrics(values, self._step)
+
+    @contextmanager
+    def _off_the_clock(self) -> Iterator[None]:
+        """What is done within is no time of training."""
+        before = self._clock.elapsed()
+        yield
+        self._clock = self._clock.without(self._clock.elapsed() - before)
 
     def _flush_metrics(self) -> None:
         """Mean of every loss term since the last flush, and where training stands, to the recorder."""
@@ -275,9 +338,10 @@ class Trainer:
 
     def _announce(self, resumed_from: int | None) -> None:
         if resumed_from is not None:
-            self.progress.note(f"resumed from the checkpoint of step {resumed_from}")
+            if resumed_from > self.stage.from_step:  # else it is the end of the stage before
+                self.progress.note(f"resumed from the checkpoint of step {resumed_from}")
             return
-        for decision in self.method.decisions:
+        for decision in self._decisions:
             self.progress.note(f"{decision.what}: {decision.why}")
 
     def _resume(self) -> int | None:
@@ -327,11 +391,16 @@ class Trainer:
             settings=self._settings,
         )
 
+    @property
+    def _decisions(self) -> tuple[Decision, ...]:
+        return (*self._growing.decisions, *self.method.decisions, *self._idle)
+
     def _surfels(self) -> int:
         return sum(len(part) for part in self.method.sets)
 
     def _report(self) -> StepReport:
-        return StepReport(self._step, self._averages.loss or 0.0, self._averages.psnr or 0.0, self._surfels())
+        averages = self._averages
+        return StepReport(self._step, averages.loss or 0.0, averages.psnr or 0.0, self._surfels(), self._seen)
 
 
 def scene_digest(scene: Scene) -> str:
@@ -345,9 +414,3 @@ def scene_digest(scene: Scene) -> str:
         sha.update(b"no normals" if view.normal is None else view.normal.flatten()[::97].contiguous().numpy().tobytes())
     sha.update(scene.points.contiguous().numpy().tobytes())
     return sha.hexdigest()[:16]
-
-
-def _psnr(image: Tensor, target: Tensor) -> float:
-    """PSNR in dB of an image clamped to [0, 1] (method.md 9: mse floor 1e-10)."""
-    mse = float((image.clamp(0, 1) - target).square_().mean())
-    return -10 * math.log10(max(mse, 1e-10))

@@ -27,14 +27,19 @@ files beside it (patterns of :meth:`pathlib.Path.glob`). Empty: nothing of it ch
 _IMPORTERS = ("import_module", "__import__")
 _LOADERS = (
     *("entry_points", "exec_module", "iter_modules", "load_module", "run_module", "run_path"),
-    *("spec_from_file_location", "walk_packages"),
+    *("CDLL", "find_spec", "load_library", "resolve_name", "spec_from_file_location", "walk_packages"),
 )
-_READERS = ("__file__", "FileSystemLoader", "PackageLoader", "get_data")
+_READERS = ("__file__", "__loader__", "__path__", "__spec__", "FileSystemLoader", "PackageLoader", "get_data")
+_RUNNERS = ("eval", "exec")  # of text; only as bare names, since models and databases have methods so called
+_RESOURCES = ("importlib.resources", "importlib_resources")
 _COMMENTED = {
-    **dict.fromkeys((".c", ".cc", ".cpp", ".cu", ".cuh", ".h", ".hpp"), r'("(?:\\.|[^"\\\n])*")|//[^\n]*|/\*.*?\*/'),
+    **dict.fromkeys(
+        (".c", ".cc", ".cpp", ".cu", ".cuh", ".h", ".hpp"),
+        r"""(R"(\w*)\(.*?\)\2"|"(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])')|//[^\n]*|/\*.*?\*/""",
+    ),
     **dict.fromkeys((".cmake", "CMakeLists.txt"), r'("(?:\\.|[^"\\])*")|#[^\n]*'),
 }
-"""Comments by a file's suffix or name, after strings, which are kept (the first group)."""
+"""Comments by a file's suffix or name, after strings and characters, which are kept (the first group)."""
 
 
 @dataclass(frozen=True)
@@ -171,6 +176,9 @@ class _ImportReader(ast.NodeVisitor):
         self._package = package
 
     def visit_Import(self, node: ast.Import) -> None:
+        for alias in node.names:
+            if alias.name in _RESOURCES:
+                self._needs_declaration(node, alias.name)
         self.imports += [(alias.name, ()) for alias in node.names]
 
     def visit_ImportFrom(self, node: ast.ImportFrom) -> None:
@@ -181,7 +189,7 @@ class _ImportReader(ast.NodeVisitor):
             if alias.name == "*" or (alias.name in (*_IMPORTERS, *_LOADERS) and alias.asname):
                 self._needs_declaration(node, f"from {base} import {alias.name}")
             self._look_at_name(node, alias.name, (*_LOADERS, *_READERS))
-        if base == "importlib.resources" or (base == "importlib" and "resources" in names):
+        if base in _RESOURCES or (base == "importlib" and "resources" in names):
             self._needs_declaration(node, "importlib.resources")
         self.imports.append((base, names))
 
@@ -194,6 +202,8 @@ class _ImportReader(ast.NodeVisitor):
 
     def visit_Call(self, node: ast.Call) -> None:
         name = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
+        if name == "getattr" and len(node.args) > 1:
+            self._look_at_getattr(node)
         if name not in _IMPORTERS:
             self.generic_visit(node)
             return
@@ -204,8 +214,16 @@ class _ImportReader(ast.NodeVisitor):
         self._needs_declaration(node, name)
         self.generic_visit(node)
 
+    def _look_at_getattr(self, node: ast.Call) -> None:
+        """``getattr(importlib, "import_module")``, and with a name made at run time."""
+        owner, attribute = node.args[:2]
+        if isinstance(attribute, ast.Constant):
+            self._look_at_name(node, str(attribute.value), (*_IMPORTERS, *_LOADERS, *_READERS))
+        elif isinstance(owner, ast.Name) and owner.id in ("importlib", "builtins", "pkgutil", "runpy"):
+            self._needs_declaration(node, f"getattr({owner.id}, ...)")
+
     def visit_Name(self, node: ast.Name) -> None:
-        self._look_at_name(node, node.id, (*_IMPORTERS, *_LOADERS, *_READERS))
+        self._look_at_name(node, node.id, (*_IMPORTERS, *_LOADERS, *_READERS, *_RUNNERS))
 
     def visit_Attribute(self, node: ast.Attribute) -> None:
         self._look_at_name(node, node.attr, (*_IMPORTERS, *_LOADERS, *_READERS))
@@ -252,8 +270,18 @@ def _without_comments(file: str, text: str) -> str:
     pattern = _COMMENTED.get(path.name, _COMMENTED.get(path.suffix))
     if pattern is None:
         return text
-    code = re.sub(pattern, lambda match: match.group(1) or " ", text, flags=re.DOTALL)
-    return " ".join(code.split())
+    strings: list[str] = []
+
+    def stand_in(match: re.Match[str]) -> str:
+        if match.group(1) is None:
+            return " "
+        strings.append(match.group(1))
+        return f"\0{len(strings) - 1}\0"
+
+    code = re.sub(pattern, stand_in, text, flags=re.DOTALL).replace("\\\n", " ")
+    lines = (f"{line} \1" if line.lstrip().startswith("#") else line for line in code.splitlines())
+    code = " ".join(" ".join(lines).split())  # blanks count in strings alone, line ends after directives alone
+    return re.sub("\0(\\d+)\0", lambda match: strings[int(match.group(1))], code)
 
 
 def _digest(text: str) -> str:

@@ -13,7 +13,9 @@ from typing import Protocol
 
 from filelock import Timeout
 
+from rtgs.core.credentials import redact
 from rtgs.track import NullTracking, RunInfo, Tracking
+from rtgs.track.protocol import STEP_TAG
 from rtgs.workflow.artifacts import Artifacts
 from rtgs.workflow.expectation import Expectation, PlanClock, spoken
 from rtgs.workflow.fingerprint import flatten
@@ -24,6 +26,11 @@ from rtgs.workflow.step import Step, StepContext, StepFailed
 from rtgs.workflow.store import Artifact, Store
 
 STEPS_EXPERIMENT = "rtgs/steps"
+IF_MEMORY = (
+    "or the machine went down. Where the system did it for want of memory (`dmesg` says so, or exit code 137): smaller "
+    "views (scene.long_side=800), fewer Gaussians (method.density.max_surfels=...), or fewer runs at a time. It goes "
+    "on from its last checkpoint"
+)
 log = logging.getLogger("rtgs.workflow")
 
 
@@ -55,13 +62,15 @@ class InlineExecutor:
         remote: RemoteStore | None = None,
         *,
         quiet: bool = False,
+        onlooker: object = None,
     ) -> None:
         """``remote``: looked into before a step is run, and given what was run. ``quiet``: another process shows how
-        far the plan is."""
+        far the plan is. ``onlooker``: who looks at trainings (:class:`rtgs.workflow.step.StepContext`)."""
         self.store = store
         self.tracking = tracking or NullTracking()
         self.remote = remote
         self.quiet = quiet
+        self.onlooker = onlooker
         self.artifacts = Artifacts()  # what the steps read, shared among them
 
     def execute(self, plan: Plan) -> tuple[StepResult, ...]:
@@ -101,7 +110,7 @@ class InlineExecutor:
             result = self.ensure(step, position, frozenset(one.fingerprint for one in before if one.executed))
         except StepFailed as error:
             log.error("%s", error)
-            trace = "".join(traceback.format_exception(error.error))
+            trace = redact("".join(traceback.format_exception(error.error)))
             return StepOutcome(step.name, step.fingerprint, None, 0.0, True, str(error), step.fingerprint, trace)
         return StepOutcome(step.name, step.fingerprint, result.folder, result.duration, result.executed)
 
@@ -118,14 +127,24 @@ class InlineExecutor:
             if artifact := self.store.find(step):
                 log.info("%s %s was made by another process", position, step.label)
                 return _result(step, artifact, executed=False)
-            if self.remote and (artifact := self.remote.fetch(step.name, step.fingerprint, self.store)):
-                log.info("%s %s from %s", position, step.label, self.remote.url)
+            if self.remote and (artifact := self._fetched(step, self.remote)):
+                log.info("%s %s from %s", position, step.label, self.remote.redacted)
                 return _result(step, artifact, executed=False)
             log.info("%s %s", position, step.label)
             artifact = self._run(step, executed)
             self._share(step, artifact)
             log.info("%s %s done in %.1f s", position, step.label, artifact.manifest.duration)
             return _result(step, artifact, executed=True)
+
+    def _fetched(self, step: Step, remote: RemoteStore) -> Artifact | None:
+        """From the remote store; where that fails, the step does, and what does not build on it goes on."""
+        try:
+            found = remote.fetch(step.name, step.fingerprint, self.store)
+        except RemoteStoreError as error:
+            raise StepFailed(step, error) from error
+        if found:
+            self.store.discard_attempts(step)  # of a process that was killed here at what another machine has made
+        return found
 
     def _share(self, step: Step, artifact: Artifact) -> None:
         """Give a new artifact to the remote store. A failure costs others time, not this run its result."""
@@ -151,21 +170,23 @@ class InlineExecutor:
 
     def _run(self, step: Step, executed: frozenset[str]) -> Artifact:
         """Execute under the lock. A failed attempt leaves nothing but its checkpoints."""
-        self.store.discard_attempts(step)
+        if self.store.discard_attempts(step):
+            log.warning("%s was cut before: its process was killed, %s", step.label, IF_MEMORY)
         attempt, partial = self.store.new_attempt(step.name, step.fingerprint), self.store.partial(step)
         partial.mkdir(parents=True, exist_ok=True)
         inputs = {other.name: self.store.folder(other) for other in step.upstream}
         tags = {f"rtgs.upstream.{other.name}": other.fingerprint for other in step.upstream}
-        info = RunInfo(STEPS_EXPERIMENT, step.label, step.fingerprint, {"rtgs.step": step.name, **tags})
-        start = time.perf_counter()
+        info = RunInfo(STEPS_EXPERIMENT, step.label, step.fingerprint, {STEP_TAG: step.name, **tags})
+        start, cpu = time.perf_counter(), time.process_time()
         try:
             with self.tracking.run(info) as tracker:
                 tracker.params({key: _scalar(value) for key, value in flatten(step.recipe).items()})
                 messages = logging.getLogger(f"rtgs.{step.name}")
-                shared = (self.artifacts, self.quiet, step.tools)
+                shared = (self.artifacts, self.quiet, step.tools, self.onlooker)
                 context = StepContext(inputs, attempt, partial, messages, tracker, executed, *shared)
                 step.run(step.params, context)
-                return self.store.publish(step, attempt, time.perf_counter() - start)
+                took = (time.perf_counter() - start, time.process_time() - cpu)
+                return self.store.publish(step, attempt, *took)
         except Exception as error:
             raise StepFailed(step, error) from error
         finally:

@@ -26,7 +26,7 @@ SECONDS = {
 SECONDS |= {"judge": 4.0, "render": 4.0, "evaluate": 4.0, "report": 3.0}
 """What a step takes at 400 pixels on one core, where none of its kind was ever run here."""
 OTHER_SECONDS = 10.0
-TRAINING_STEP_SECONDS = {"plain": 0.03, "train_diffuse": 0.03, "train_reflection": 0.12}
+TRAINING_STEP_SECONDS = {"plain": 0.03, "train_diffuse": 0.03, "train_reflection": 0.12, "train_shading": 0.06}
 OTHER_TRAINING_STEP_SECONDS = 0.2
 _PRIOR_SECONDS = 20.0  # weight of the expectation against what was seen
 

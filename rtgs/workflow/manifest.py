@@ -39,6 +39,7 @@ class Manifest:
         machine: threads, instruction set, processor and system; results are bit for bit the same where these agree.
         versions: of rtgs, Python and the libraries that were loaded.
         created: UTC, ISO 8601.
+        cpu_seconds: CPU time of the same, all threads of the process; None: an older version published it.
     """
 
     step: str
@@ -52,6 +53,7 @@ class Manifest:
     created: str
     machine: dict[str, Any] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=dict)
+    cpu_seconds: float | None = None
 
     def write(self, folder: Path) -> None:
         """Write ``folder/manifest.json``."""
@@ -80,7 +82,7 @@ class Manifest:
         return sum(record.size for record in self.files.values())
 
 
-def describe(step: Step, folder: Path, duration: float, created: str) -> Manifest:
+def describe(step: Step, folder: Path, duration: float, created: str, cpu_seconds: float | None = None) -> Manifest:
     """The manifest of a finished folder (digests every file in it)."""
     return Manifest(
         step=step.name,
@@ -98,6 +100,7 @@ def describe(step: Step, folder: Path, duration: float, created: str) -> Manifes
         created=created,
         machine=machine(),
         versions=versions(),
+        cpu_seconds=cpu_seconds,
     )
 
 

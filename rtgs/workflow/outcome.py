@@ -64,6 +64,10 @@ class SweepOutcomes:
         mine = (self.outcomes.get(planned.step.fingerprint) for planned in plan)
         return frozenset(outcome.fingerprint for outcome in mine if outcome is not None and outcome.executed)
 
+    def seconds(self, plan: Plan) -> float:
+        """What the steps of ``plan`` that this sweep ran took together."""
+        return sum(self.outcomes[fingerprint].duration for fingerprint in self.executed(plan))
+
     def as_planned(self, plan: Plan) -> Plan:
         """``plan`` of a job as it was before the sweep ran its steps: what was missing then, and why."""
         return Plan(tuple(self.planned.get(planned.step.fingerprint, planned) for planned in plan))

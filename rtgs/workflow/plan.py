@@ -17,6 +17,9 @@ from rtgs.workflow.store import Store
 _REASONS = 3  # differences told for one step
 _VALUE_LENGTH = 40
 _ABSENT = object()
+_READ = ("params.capture", "params.source", "params.settings.name", "params.scene.name")
+"""Of recipes of steps without upstream: what they read. One that shares none of it with an artifact is of new input."""
+NEW_INPUT = "never ran on this capture"
 
 
 @dataclass(frozen=True)
@@ -78,12 +81,13 @@ def make_plan(targets: Sequence[Step], store: Store, remote: RemoteStore | None 
         raise RtgsError("nothing to plan: the graph has no target steps")
     planned: list[PlannedStep] = []
     neighbours: dict[str, Neighbours] = {}
+    new: set[str] = set()  # steps on input that no artifact is of
     for step in topological(targets):
         if store.find(step) is not None:
             planned.append(PlannedStep(step, True, ""))
             continue
         if remote and remote.manifest(step.name, step.fingerprint) is not None:
-            planned.append(PlannedStep(step, False, f"will be fetched from {remote.url}", remote=True))
+            planned.append(PlannedStep(step, False, f"will be fetched from {remote.redacted}", remote=True))
             continue
         if store.folder(step).is_dir():
             reason = "its artifact is damaged"
@@ -91,6 +95,9 @@ def make_plan(targets: Sequence[Step], store: Store, remote: RemoteStore | None 
             if step.name not in neighbours:
                 neighbours[step.name] = Neighbours([artifact.manifest for artifact in store.artifacts(step.name)])
             reason = neighbours[step.name].explain_miss(step)
+            if neighbours[step.name].are_of_others(step) or any(each.fingerprint in new for each in step.upstream):
+                new.add(step.fingerprint)
+                reason = NEW_INPUT
         if store.partial(step).exists():
             reason += "; resumes from its checkpoint"
         planned.append(PlannedStep(step, False, reason))
@@ -117,6 +124,14 @@ class Neighbours:
         for key in recipe.keys() & self._columns.keys():
             row[self._columns[key]] = self._codes.setdefault((key, recipe[key]), len(self._codes) + 1)
         return row
+
+    def are_of_others(self, step: Step) -> bool:
+        """Whether there are manifests, and all are of other input; of a step with upstream that is not asked here."""
+        own = {key: value for key, value in _recipe_of(step).items() if key in _READ}
+        if step.upstream or not own or not self._manifests:
+            return False
+        recipes = (_recipe_of(manifest) for manifest in self._manifests)
+        return not any(recipe.get(key) == value for recipe in recipes for key, value in own.items())
 
     def explain_miss(self, step: Step) -> str:
         """Why ``step`` is not cached, against the cached manifest with the fewest differences."""

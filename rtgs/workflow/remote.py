@@ -20,6 +20,7 @@ from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from rtgs.core.credentials import hide, redact
 from rtgs.core.documents import load_json, parse_json
 from rtgs.core.errors import RtgsError
 from rtgs.workflow import manifest as manifests
@@ -50,17 +51,25 @@ class RemoteStore:
             RemoteStoreError: no file system for this kind of URL, or fsspec is not installed.
         """
         self.url = url.rstrip("/")
+        hide(self.url)
         try:
             import fsspec
         except ImportError as error:
-            raise RemoteStoreError("a remote store needs fsspec: pip install 'rtgs[cluster]'") from error
+            raise RemoteStoreError(
+                "a remote store needs fsspec: pip install -e '.[cluster]' in the clone of rtgs"
+            ) from error
         try:
             self._fs, self._root = fsspec.core.url_to_fs(self.url)
         except (ValueError, ImportError) as error:
             raise RemoteStoreError(
-                f"remote store {self.url}: {error} (extra `cluster` brings s3fs for s3://)"
+                redact(f"remote store {self.url}: {error} (extra `cluster` brings s3fs for s3://)")
             ) from error
         self._fs.use_listings_cache = False  # others write there while we look
+
+    @property
+    def redacted(self) -> str:
+        """The address without credentials, for people."""
+        return redact(self.url)
 
     def manifest(self, name: str, fingerprint: str) -> Manifest | None:
         """The manifest of a finished artifact there; None when there is none."""
@@ -85,8 +94,8 @@ class RemoteStore:
         wanted = found is not None and (found.step, found.fingerprint) == (name, fingerprint)
         if found is None or not wanted or not isinstance(sent, str) or not _SENT.fullmatch(sent):
             raise RemoteStoreError(
-                f"{self.url}: the manifest of {name} {fingerprint[:12]} is not one of that artifact; delete the folder "
-                f"{folder} there"
+                f"{self.redacted}: the manifest of {name} {fingerprint[:12]} is not one of that artifact; delete the "
+                f"folder {redact(folder)} there"
             )
         return found, f"{folder}/{sent}".rstrip("/")
 
@@ -150,12 +159,12 @@ class RemoteStore:
         attempt = store.new_attempt(name, fingerprint)
         try:
             for file, record in manifest.files.items():
-                target = attempt / _inside(file, self.url)
+                target = attempt / _inside(file, self.redacted)
                 target.parent.mkdir(parents=True, exist_ok=True)
                 self._download(f"{source}/{file}", target)
                 if target.stat().st_size != record.size or file_digest(target) != record.sha256:
                     raise RemoteStoreError(
-                        f"{self.url}: {name}/{fingerprint[:12]}/{file} is not what its manifest says; delete the "
+                        f"{self.redacted}: {name}/{fingerprint[:12]}/{file} is not what its manifest says; delete the "
                         "artifact there, the next run makes it again"
                     )
             manifest.write(attempt)
@@ -173,9 +182,10 @@ class RemoteStore:
         return f"{self._root}/{name}/{fingerprint[:2]}/{fingerprint}"
 
     def _unreachable(self, error: BaseException) -> RemoteStoreError:
+        said = redact(f"remote store {self.url}: {type(error).__name__}: {error}")
         return RemoteStoreError(
-            f"remote store {self.url}: {type(error).__name__}: {error}; check its address and credentials, or run "
-            "without it (paths.remote=''): the local store is complete in itself"
+            f"{said}; check its address and credentials, or run without it (paths.remote=''): the local store is "
+            "complete in itself"
         )
 
 

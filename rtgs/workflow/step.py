@@ -36,6 +36,7 @@ class StepContext:
         artifacts: what steps of this run have read of artifacts already; see :meth:`read`.
         quiet: another process shows how far the plan is, so this step draws no display of its own.
         tools: what the recipe names of outside tools (:class:`Step`). A step refuses to run with others.
+        onlooker: who looks at trainings (``rtgs.train.onlooker.Onlooker``); None: nobody. No result depends on it.
     """
 
     inputs: dict[str, Path]
@@ -47,6 +48,7 @@ class StepContext:
     artifacts: Artifacts = field(default_factory=Artifacts)
     quiet: bool = False
     tools: tuple[tuple[str, str], ...] = ()
+    onlooker: Any = None
 
     def read(self, name: str, reader: Callable[[Path], T]) -> T:
         """The artifact of the step ``name`` through ``reader``; read once for all steps of a run, so never changed."""

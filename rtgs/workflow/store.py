@@ -10,12 +10,13 @@ Layout under the root::
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import secrets
 import shutil
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -29,6 +30,7 @@ from rtgs.workflow.manifest import Manifest
 from rtgs.workflow.step import Step
 
 _TEMPORARY = re.compile(r"([0-9a-f]{64})\.tmp-[0-9a-f]+")
+_STALE_TRIES = 3
 _FINGERPRINT = re.compile(r"[0-9a-f]{64}")
 
 
@@ -60,7 +62,11 @@ class Store:
 
     def folder(self, step: Step) -> Path:
         """Where the artifact of ``step`` is, or will be."""
-        return self._shelf(step.name, step.fingerprint) / step.fingerprint
+        return self.folder_of(step.name, step.fingerprint)
+
+    def folder_of(self, name: str, fingerprint: str) -> Path:
+        """Where the artifact of a recipe by its name is, or will be."""
+        return self._shelf(name, fingerprint) / fingerprint
 
     def partial(self, step: Step) -> Path:
         """The folder for checkpoints of ``step``."""
@@ -79,7 +85,7 @@ class Store:
 
     def has(self, name: str, fingerprint: str) -> bool:
         """Whether the finished artifact of this recipe is here."""
-        return _artifact(self._shelf(name, fingerprint) / fingerprint) is not None
+        return _artifact(self.folder_of(name, fingerprint)) is not None
 
     def lock_of(self, name: str, fingerprint: str) -> FileLock:
         """The kernel lock of a recipe by its name, not yet acquired."""
@@ -98,24 +104,27 @@ class Store:
         """Remove an attempt that is not wanted, or was published: whichever it is, nothing is left of it."""
         shutil.rmtree(attempt, ignore_errors=True)
 
-    def discard_attempts(self, step: Step) -> None:
-        """Remove what killed attempts left. Only for the holder of the lock: then every temporary folder is dead."""
-        for path in self._shelf(step.name, step.fingerprint).glob(f"{step.fingerprint}.tmp-*"):
+    def discard_attempts(self, step: Step) -> int:
+        """Remove what killed attempts left, and say how many there were. Only for the holder of the lock: then every
+        temporary folder is dead."""
+        dead = list(self._shelf(step.name, step.fingerprint).glob(f"{step.fingerprint}.tmp-*"))
+        for path in dead:
             shutil.rmtree(path, ignore_errors=True)
+        return len(dead)
 
-    def publish(self, step: Step, attempt: Path, duration: float) -> Artifact:
+    def publish(self, step: Step, attempt: Path, duration: float, cpu_seconds: float | None = None) -> Artifact:
         """Turn a finished attempt into the artifact: manifest, fsync, one rename; its checkpoints are removed.
 
         When the artifact exists by now, someone else won: the attempt is dropped and theirs returned.
         """
         created = datetime.now(UTC).isoformat(timespec="seconds")
-        manifests.describe(step, attempt, duration, created).write(attempt)
+        manifests.describe(step, attempt, duration, created, cpu_seconds).write(attempt)
         return self.adopt(step.name, step.fingerprint, attempt)
 
     def adopt(self, name: str, fingerprint: str, attempt: Path) -> Artifact:
         """Put a complete attempt, manifest included, in its place with one rename; the first one there wins."""
         _sync_tree(attempt)
-        place = self._shelf(name, fingerprint) / fingerprint
+        place = self.folder_of(name, fingerprint)
         if place.exists() and _artifact(place) is None:
             shutil.rmtree(place)  # without a sound manifest: garbage
         try:
@@ -158,6 +167,8 @@ class Store:
             lock = self.lock_of(name, fingerprint)
             try:
                 with lock.acquire(timeout=0):
+                    if not path.exists():
+                        continue  # another collection was here
                     size += sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
                     shutil.rmtree(path)
                     dead.append(path)
@@ -182,6 +193,14 @@ class Store:
 
 
 def _artifact(folder: Path) -> Artifact | None:
+    """None where there is none. A disk that fails raises: what cannot be read now is not garbage."""
+    for _ in range(_STALE_TRIES):
+        with suppress(_Stale), _stale_apart():
+            return _read_artifact(folder)
+    return _read_artifact(folder)
+
+
+def _read_artifact(folder: Path) -> Artifact | None:
     manifest = Manifest.read(folder)
     if manifest is None:
         return None
@@ -189,9 +208,23 @@ def _artifact(folder: Path) -> Artifact | None:
         try:
             if (folder / name).stat().st_size != record.size:
                 return None
-        except OSError:
+        except (FileNotFoundError, NotADirectoryError):
             return None
     return Artifact(folder, manifest)
+
+
+class _Stale(Exception):
+    """A handle of a network file system that another machine's change made void; opening again gives a new one."""
+
+
+@contextmanager
+def _stale_apart() -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        if error.errno == errno.ESTALE:
+            raise _Stale from error
+        raise
 
 
 def _defects(folder: Path, manifest: Manifest) -> list[str]:

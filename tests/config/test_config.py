@@ -15,6 +15,7 @@ from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
+from recipes import TRAINED
 
 from pipelines.planning.graph import build_graph
 from pipelines.planning.inspection import Inspections
@@ -84,16 +85,16 @@ def test_the_schema_goes_to_other_processes_by_name():
 def test_the_command_line_wins_over_files_and_preset():
     config, choices = compose(["scene=fox", "method=2dgs", "schedule.total=33", "scene.long_side=64", "seed=3"])
     assert (config.schedule.total, config.scene.long_side, config.seed) == (33, 64, 3)
-    assert config.name == "fox-2dgs-quick-seed3"
+    assert config.name == "fox-2dgs-quick-seed3-scene.long_side_64-schedule.total_33"
     assert choices.overrides == ("schedule.total=33", "scene.long_side=64", "seed=3")
 
 
 @pytest.mark.parametrize(
     ("override", "expected"),
     [
-        ("method.los.l1=3", ["Key 'los' not in 'MethodSettings'", "method.los", "Did you mean loss"]),
+        ("method.los.l1=3", ["Key 'los' not in 'MethodSettings'", "method.los", "Did you mean method.loss"]),
         ("metod=2dgs", ["metod", "Did you mean method"]),
-        ("schedule.totl=3", ["schedule.totl", "Did you mean total"]),
+        ("schedule.totl=3", ["schedule.totl", "Did you mean schedule.total"]),
         ("method.loss.l1=abc", ["'abc' of type 'str' could not be converted to Float", "method.loss.l1"]),
         ("schedule.total=1.5", ["schedule.total", "Integer"]),
         ("scene=nope", ["scene/nope", "fox", "scene=/path/to/capture"]),
@@ -112,10 +113,10 @@ def test_a_mistake_on_the_command_line_is_named(override, expected):
 @pytest.mark.parametrize(
     ("group", "content", "expected"),
     [
-        ("method", "name: 2dgs\nlos:\n  l1: 1.0\n", ["method/spoilt", "'los'", "Did you mean loss"]),
+        ("method", "name: 2dgs\nlos:\n  l1: 1.0\n", ["method/spoilt", "'los'", "Did you mean method.loss"]),
         ("method", "name: 2dgs\nloss:\n  l1: much\n", ["method/spoilt", "'much'", "method.loss.l1"]),
         ("ablation", "# @package _global_\nmethod:\n  lossy: 1\n", ["ablation/spoilt", "'lossy'"]),
-        ("experiment", "# @package _global_\nsede: 3\n", ["experiment/spoilt", "'sede'", "Did you mean seed"]),
+        ("experiment", "# @package _global_\nseedd: 3\n", ["experiment/spoilt", "'seedd'", "Did you mean seed"]),
         ("scene", "name: x\npath: y\nlong_side: wide\n", ["scene/spoilt", "'wide'", "scene.long_side"]),
     ],
 )
@@ -214,7 +215,7 @@ def test_method_preset_and_ablation_compose_and_no_ablation_is_idle():
     methods = {name: methods_of(name) for name in ABLATIONS}
     keys: dict[tuple[str, str, str], str] = {}
     inspections = Inspections()
-    for method, preset in product(choices_of("method"), presets):
+    for method, preset in product(TRAINED, presets):
         meet = [name for name in ABLATIONS if preset == "paper" or keys_in("ablation", name) & presets[preset]]
         mine = ["none", *(name for name in meet if method in methods[name])]
         words = [f"method={method}", f"preset={preset}", f"ablation={','.join(mine)}"]
@@ -313,7 +314,7 @@ def raw_configs(groups: str, keys: Sequence[tuple[str, ...]]) -> dict[tuple[str,
 def methods_of(ablation: str) -> tuple[str, ...]:
     """The methods that have what an ablation takes away."""
     needs = set(ablation_file(ablation)["ablation"].get("needs", ()))
-    return tuple(name for name in choices_of("method") if needs <= find_method(name).has)
+    return tuple(name for name in TRAINED if needs <= find_method(name).has)
 
 
 def ablation_file(name: str) -> dict:

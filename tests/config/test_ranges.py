@@ -9,7 +9,9 @@ import pytest
 
 from rtgs.config.schema import MeshConfig, RunConfig
 from rtgs.core.errors import RtgsError
+from rtgs.evaluate.settings import EvaluationSettings
 from rtgs.gaussians.settings import DensitySettings, InitSettings, McmcSettings, OptimizerSettings
+from rtgs.methods.photo_settings import AppearanceSettings, PoseSettings
 from rtgs.methods.settings import ReflectionSettings, TransmittanceSettings
 from rtgs.prepare.masks.settings import DrawnSettings
 from rtgs.prepare.settings import FeatureSettings, MappingSettings, MatchingSettings, SfmSettings, VideoSettings
@@ -47,6 +49,12 @@ NONSENSE = [
     (RenderSettings, "depth_ratio", 1.5),
     (RenderSettings, "background", (0.0, 2.0, 0.0)),
     (ReflectionSettings, "smallest_alpha", 2.0),
+    (AppearanceSettings, "rate", 0.0),
+    (AppearanceSettings, "mean_exposure", -1.0),
+    (AppearanceSettings, "warm_up", -1),
+    (PoseSettings, "rate_end", 0.0),
+    (PoseSettings, "decay", math.inf),
+    (EvaluationSettings, "refine_steps", 0),
     (TransmittanceSettings, "rim", -1),
     (TransmittanceSettings, "keep_seen", -1),
     (TransmittanceSettings, "sh_degree", 9),

@@ -13,8 +13,10 @@ LONGEST = 120  # characters of a line that is neither a row of a table nor a lin
 MOST_WORDS = 950  # of a page that has no limit of its own
 LIMITS = {
     "README.md": 550,
-    "docs/README.md": 300,
+    "docs/README.md": 420,
     "docs/architecture.md": 1_100,
+    "docs/benchmarks.md": 1_000,
+    "docs/pipeline.md": 1_000,
     "docs/rasterizer.md": 1_500,
     "docs/transmittance.md": 750,
 }

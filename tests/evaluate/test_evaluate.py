@@ -14,7 +14,7 @@ from PIL import Image
 from rtgs.core.errors import RtgsError
 from rtgs.evaluate.evaluate import NO_TEST_VIEWS, TimedRender, evaluate_views, write_error_maps
 from rtgs.evaluate.images import colorize, error_map
-from rtgs.evaluate.metrics import psnr, ssim
+from rtgs.evaluate.metrics import cc_psnr, psnr, ssim
 from rtgs.evaluate.records import METRICS, RunFacts, read_json, write_csv, write_json
 from rtgs.evaluate.settings import EvaluationSettings
 from rtgs.evaluate.tables import PAPER_SCORES, summarize
@@ -92,6 +92,18 @@ def test_pixels_that_three_training_views_frame_are_scored_by_themselves() -> No
     assert (second["psnr_framed"], second["framed_share"]) == (None, 0.0)
     assert (third["psnr_framed"], third["framed_share"]) == (None, None)
     assert table.missing["framed_share"].startswith("1 of 3 views were rendered without maps")
+
+
+def test_figures_that_have_seen_the_photo_stand_beside_psnr() -> None:
+    renders, photos = capture()
+    refined = [replace(render, refined=photo.image) for render, photo in zip(renders[:2], photos)]
+    table = evaluate_views([*refined, renders[2]], photos, FACTS)
+    first, _, third = (row.values for row in table.rows)
+    assert first["psnr"] == psnr(renders[0].image, photos[0].image)
+    assert first["cc_psnr"] == cc_psnr(renders[0].image, photos[0].image)
+    assert (first["psnr_refined_poses"], third["psnr_refined_poses"]) == (100.0, None)
+    assert table.count("cc_psnr") == 3
+    assert table.missing["psnr_refined_poses"].startswith("no poses are learned")
 
 
 def test_lpips_without_weights_is_absent_with_its_reason() -> None:

@@ -63,15 +63,17 @@ def test_seeds_give_mean_and_sample_deviation():
 
 
 @pytest.mark.parametrize("data", ["stand_in", "own"])
-def test_the_papers_columns_exist_only_on_the_papers_data(tmp_path, data):
+def test_differences_to_the_paper_exist_only_on_the_papers_data(tmp_path, data):
     """The scenes are even called like the paper's: what decides is whose data they are."""
     runs = [run("rtgs", "sedan", 30.0), run("envgs", "ball_statue", 29.0)]
     texts = {
         path.suffix: path.read_text() for path in write_table(tmp_path, build_table(TableSpec("t", "T", data), runs))
     }
     for text in texts.values():
-        for trace in ("26.2", "25.5", "0.728", "ours - paper", "minus_paper", "paper_psnr", "The paper's figures"):
+        for trace in ("ours - paper", "minus_paper", "paper_psnr", "Against the paper"):
             assert trace not in text
+        for trace in ("26.2", "25.5", "0.728", "ublished"):
+            assert (trace in text) == (data == "stand_in")
     if data == "stand_in":
         assert "not comparable" in texts[".md"]
     same = {
@@ -235,3 +237,34 @@ def test_cells_are_escaped_for_latex_and_for_spreadsheets():
     assert row["method"] == "'=cmd|'/c calc'!A1"
     assert row["scene"] == "'@sum{a}"
     assert float(row["psnr"]) == 25.0
+
+
+def test_every_published_row_stands_beside_what_was_run_in_columns_of_its_own(tmp_path):
+    runs = [run("rtgs", "ball_statue", 28.0), run("NU-NeRF", "ball_statue", 21.0), run("2dgs", "ball_statue", 27.0)]
+    table = build_table(STAND_IN, runs)
+    lines = markdown(table).splitlines()
+    marked = "ballstatue published, on the papers' data: PSNR / SSIM / LPIPS"
+    assert lines[2].split(" | ")[-1] == f"{marked} |"
+    rows = {line.split(" | ")[0].strip("| "): line for line in lines[4 : lines.index("", 4)]}
+    assert rows["rtgs"].endswith("| 26.05 / 0.885 / 0.174 |")
+    assert rows["NU-NeRF"].endswith("| 23.45 / 0.706 / 0.345 |")  # a label of another program finds its row
+    assert rows["2dgs"].endswith("|  |")  # the paper has none
+    assert rows["ref_gaussian"].count("|  ") == 4  # not run: nothing but what is published
+    assert rows["ref_gaussian"].endswith("| 15.14 / 0.660 / 0.479 |")
+    assert not {"nu_nerf", "rtgs, no_depth_loss"} & rows.keys()
+    assert "Rows that have published figures alone were not run here." in "\n".join(lines)
+    assert all(cell.ranks.get("psnr") for cell in table.cells.values())  # published figures take no place
+    found = {row["method"]: row for row in csv.DictReader(io.StringIO(comma_separated(table)))}
+    assert (found["envgs"]["psnr"], found["envgs"]["published_psnr"]) == ("", "25.508")
+    assert (found["2dgs"]["psnr"], found["2dgs"]["published_psnr"]) == ("27.0", "")
+    texts = {path.suffix: path.read_text() for path in write_table(tmp_path, table)}
+    assert all("15.14 / 0.660 / 0.479" in texts[suffix] for suffix in (".md", ".tex", ".html"))
+
+
+def test_a_table_of_ablations_has_the_papers_ablations_alone():
+    runs = [run("rtgs", "ball_statue", 28.0), run("rtgs, no_depth_loss", "ball_statue", 27.0)]
+    table = build_table(STAND_IN, runs)
+    assert list(dict.fromkeys(row for row, _ in table.published)) == [
+        *("rtgs", "rtgs, no_depth_loss", "rtgs, no_transmittance_gaussians", "rtgs, no_specular_loss"),
+        "rtgs, no_mesh_guide",
+    ]

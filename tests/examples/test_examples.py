@@ -90,6 +90,14 @@ def test_05_writes_a_picture_for_each_frame(first: Path, tmp_path: Path):
     assert min(map(spread, frames)) > 10
 
 
+@pytest.mark.parametrize("more", [(), ("--surfels",)], ids=["ellipsoids", "surfels"])
+def test_06_fits_a_photo(tmp_path: Path, more: tuple[str, ...]):
+    said = run("06", tmp_path / "out", "--size", "48", "--steps", "40", *more)
+    before, after = map(float, re.findall(r"([\d.]+) dB", said))
+    assert after > before + 5
+    assert spread(tmp_path / "out" / "image.png") > 10
+
+
 def test_every_script_is_run_here_and_short():
     scripts = sorted(FOLDER.glob("*.py"))
     numbers = [path.name[:2] for path in scripts]

@@ -11,11 +11,20 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 import torch
-from PIL import Image
+from PIL import Image, ImageCms
+from safetensors.torch import save_file
 
-from pipelines.publishing.run_record import RunRecord
+from pipelines.cli.show import read_transform
+from pipelines.steps.external import ExternalRecord
+from rtgs.core.cameras import Camera
+from rtgs.evaluate.external import read_external
 from rtgs.evaluate.records import METRICS, EvaluationTable, RunFacts, ViewScore, read_json, write_json
-from rtgs.gaussians.ply import read_gaussians, write_ply
+from rtgs.evaluate.settings import ExternalSettings
+from rtgs.export.compressed_ply import read_compressed_ply, write_compressed_ply
+from rtgs.export.glass import GlassObject
+from rtgs.export.gltf import read_glb, write_glb
+from rtgs.export.spz import read_spz, write_spz
+from rtgs.gaussians.ply import read_gaussians, read_ply, write_ply
 from rtgs.gaussians.surfels import Surfels
 from rtgs.mesh.record import MeshRecord
 from rtgs.mesh.triangles import TriangleMesh, read_mesh_obj, read_mesh_ply, write_mesh_obj, write_mesh_ply
@@ -26,15 +35,20 @@ from rtgs.prepare.poses.export import read_lenses, write_lenses
 from rtgs.prepare.poses.photos import lay_out, read_photo_set
 from rtgs.prepare.poses.quality import SfmReport
 from rtgs.prepare.poses.world import WorldChange
+from rtgs.pretrained.weights import read_tensors
+from rtgs.render.camera_path import read_camera_path
+from rtgs.runs.record import RunRecord
+from rtgs.scenes.canonical import read_scene, save_scene
 from rtgs.scenes.check import check_capture
 from rtgs.scenes.images import read_mask, read_normals, read_photo
 from rtgs.scenes.importers.transforms import read_point_file
-from rtgs.scenes.scene import load_scene
+from rtgs.scenes.scene import View, load_scene
 from rtgs.scenes.settings import CaptureError, SceneSettings
 from rtgs.scenes.splits import read_split_file
 from rtgs.scenes.synthetic.description import SCENES, read_description
 from rtgs.scenes.truth import ViewTruth, read_truth, write_truth
 from rtgs.scenes.undistort import Lens
+from rtgs.train.checkpoint import Checkpoint, CheckpointRecord, load_checkpoint, save_checkpoint
 from rtgs.workflow.manifest import Manifest
 from tests.scenes import captures
 
@@ -135,6 +149,38 @@ def _read_gaussians(folder: Path) -> None:
     assert all(torch.isfinite(values).all() for _, values in gaussians.items())
 
 
+def _write_glb(folder: Path) -> None:
+    _gaussians(text=False)(folder)
+    corners = np.eye(3, dtype=np.float32)
+    glass = GlassObject(corners, corners, np.array([[0, 1, 2]]), 1.5, (1.0, 1.0, 1.0), 0.0)
+    write_glb(folder / "a.glb", read_ply(folder / "a.ply"), glass=glass)
+
+
+def _read_glb(folder: Path) -> None:
+    found = read_glb(folder / "a.glb")
+    assert all(torch.isfinite(values).all() for _, values in found.splats.items())
+    assert np.isfinite(found.vertices).all()
+    assert not len(found.faces) or found.faces.max() < len(found.vertices)
+
+
+def _write_compressed(folder: Path) -> None:
+    _gaussians(text=False)(folder)
+    write_compressed_ply(folder / "b.ply", read_ply(folder / "a.ply"))
+
+
+def _read_compressed(folder: Path) -> None:
+    assert all(torch.isfinite(values).all() for _, values in read_compressed_ply(folder / "b.ply").items())
+
+
+def _write_spz(folder: Path) -> None:
+    _gaussians(text=False)(folder)
+    write_spz(folder / "a.spz", read_ply(folder / "a.ply"))
+
+
+def _read_spz(folder: Path) -> None:
+    assert all(torch.isfinite(values).all() for _, values in read_spz(folder / "a.spz").items())
+
+
 MESH = TriangleMesh(np.eye(4, 3), np.array([[0, 1, 2], [1, 2, 3]]), np.full((4, 3), 0.5))
 
 
@@ -231,6 +277,7 @@ def _write_records(folder: Path) -> None:
     record = {"size": 3, "sha256": "f" * 64}
     whole = Manifest("render", 1, "f" * 64, {"maps": True}, {}, {}, {}, 1.0, "2026")
     (folder / "manifest.json").write_text(json.dumps(asdict(whole) | {"files": {"a": record}}))
+    ExternalRecord(("2 pictures in it are of no test view",)).write(folder)
     (folder / "split.json").write_text('{"train": ["a.jpg"], "test": ["b.jpg"]}')
 
 
@@ -240,6 +287,7 @@ RECORDS: dict[str, Callable[[Path], object]] = {
     "masks.json": MaskReport.read,
     "sfm.json": SfmReport.read,
     "normals.json": read_message,
+    "external.json": ExternalRecord.read,
     "lenses.json": read_lenses,
     "split.json": lambda folder: read_split_file(folder / "split.json", ["a.jpg", "b.jpg", "c/b.jpg"]),
 }
@@ -268,6 +316,97 @@ def _read_truth(folder: Path) -> None:
     assert truth.objects.shape == truth.specular.shape == truth.second_depth.shape == truth.depth.shape
 
 
+def _external_views() -> tuple[View, ...]:
+    eye, zero = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+    image = torch.linspace(0, 1, 3 * 6 * 8).reshape(3, 6, 8)
+    camera = Camera(eye, zero, 9.0, 9.0, 4.0, 3.0, 8, 6)
+    return tuple(View(camera, image, None, None, name) for name in ("left/a.jpg", "b.jpg"))
+
+
+def _write_external(folder: Path) -> None:
+    views = _external_views()
+    pixels = (views[0].image.permute(1, 2, 0).numpy() * 255).astype(np.uint8)
+    profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    for name in ("renders", "layers/reflection", "layers/depth", "layers/normal"):
+        (folder / name / "left").mkdir(parents=True)
+    Image.fromarray(pixels).save(folder / "renders" / "left" / "a.png", icc_profile=profile)
+    Image.fromarray(pixels).save(folder / "renders" / "b.jpg", icc_profile=profile)
+    for name in ("left/a", "b"):
+        np.save(folder / "layers" / "reflection" / f"{name}.npy", views[0].image.numpy())
+        np.save(folder / "layers" / "depth" / f"{name}.npy", np.ones((6, 8)))
+        np.save(folder / "layers" / "normal" / f"{name}.npy", np.full((6, 8, 3), 0.6))
+
+
+def _read_external(folder: Path) -> None:
+    settings = ExternalSettings(str(folder / "renders"), layers=str(folder / "layers"))
+    for tensors in read_external(settings, _external_views()).views.values():
+        assert tensors["image"].shape == tensors["normal"].shape == (3, 6, 8)
+        assert all(torch.isfinite(values).all() for values in tensors.values())
+
+
+def _camera_path() -> Files:
+    turn = [1, 0, 0, 0.5, 0, 1, 0, 0, 0, 0, 1, 2, 0, 0, 0, 1]
+    frames = [{"camera_to_world": turn, "fov": 50 + number, "aspect": 1.5} for number in range(3)]
+    content = {"camera_type": "perspective", "render_width": 60, "render_height": 40, "camera_path": frames}
+    return {"camera_path.json": json.dumps(content).encode()}
+
+
+def _read_camera_path(folder: Path) -> None:
+    for camera in read_camera_path(folder / "camera_path.json"):
+        assert torch.isfinite(camera.camera_rays()).all()
+        assert torch.isfinite(camera.center).all()
+
+
+def _write_scene(folder: Path) -> None:
+    with TemporaryDirectory() as place:
+        _write_transforms(Path(place))
+        save_scene(load_scene(SceneSettings(path=place)), folder)
+
+
+def _read_scene(folder: Path) -> None:
+    scene = read_scene(folder)
+    for view in (*scene.train, *scene.test):
+        assert torch.isfinite(view.camera.camera_rays()).all()
+        assert view.image.shape == (3, view.camera.height, view.camera.width)
+    assert scene.points.shape == scene.point_colors.shape
+    assert 0 < scene.extent < float("inf")
+
+
+def _write_checkpoint(folder: Path) -> None:
+    record = CheckpointRecord(3, "a", "b", 1, "avx2", (("torch", "2"),), 1.0, 1.0, 0.5, None, 0, "{}")
+    save_checkpoint(folder, Checkpoint(record, {"x": torch.ones(4, 3)}))
+
+
+def _read_checkpoint(folder: Path) -> None:
+    record = load_checkpoint(folder / "step_00000003").record
+    assert type(record.step) is int
+    assert type(record.threads) is int
+    assert isinstance(record.settings, str)
+
+
+def _write_weights(folder: Path) -> None:
+    tensors = {"a.weight": torch.ones(4, 3), "a.bias": torch.zeros(4)}
+    save_file(tensors, folder / "a.safetensors")
+    torch.save(tensors, folder / "b.pth")
+
+
+def _read_weights(folder: Path) -> None:
+    for path in sorted(folder.iterdir()):
+        assert all(isinstance(tensor, torch.Tensor) for tensor in read_tensors(path).values())
+
+
+def _transform() -> Files:
+    content = {"transform": [[1.0, 0, 0, 0.5], [0, 1.0, 0, 0], [0, 0, 1.0, 2.0]], "scale": 0.3}
+    return {"dataparser_transforms.json": json.dumps(content).encode()}
+
+
+def _read_transform(folder: Path) -> None:
+    found = read_transform(folder / "dataparser_transforms.json")
+    assert found is not None
+    assert torch.isfinite(found[0]).all()
+    assert 0 < found[1] < float("inf")
+
+
 def _described() -> Files:
     return {"scene.toml": (SCENES / "ball_statue.toml").read_bytes()}
 
@@ -287,6 +426,9 @@ READERS: dict[str, Reader] = {
         Reader("capture photo", _colmap(text=False), ("images/photo_01.png",), _capture),
         Reader("splat", _files_of(_gaussians(text=False)), ("a.ply",), _read_gaussians),
         Reader("splat text", _files_of(_gaussians(text=True)), ("a.ply",), _read_gaussians),
+        Reader("glb", _files_of(_write_glb), ("a.glb",), _read_glb),
+        Reader("spz", _files_of(_write_spz), ("a.spz",), _read_spz),
+        Reader("compressed splat", _files_of(_write_compressed), ("b.ply",), _read_compressed),
         Reader("points", _files_of(_write_transforms), ("points.ply",), lambda f: read_point_file(f / "points.ply")),
         Reader("mesh ply", _files_of(lambda f: write_mesh_ply(f / "a.ply", MESH)), ("a.ply",),
                _mesh(read_mesh_ply, "a.ply")),
@@ -301,7 +443,16 @@ READERS: dict[str, Reader] = {
         Reader("metrics.json", _files_of(_write_metrics), ("metrics.json",), _read_metrics),
         *(Reader(name, _files_of(_write_records), (name,), _record(name)) for name in RECORDS),
         Reader("manifest.json", _files_of(_write_records), ("manifest.json",), _read_manifest),
+        Reader("external", _files_of(_write_external), ("renders/left/a.png", "renders/b.jpg",
+               "layers/reflection/b.npy", "layers/depth/b.npy", "layers/normal/b.npy"), _read_external),
+        Reader("camera path", _camera_path, ("camera_path.json",), _read_camera_path),
         Reader("description", _described, ("scene.toml",), lambda f: read_description(f / "scene.toml")),
+        Reader("scene.json", _files_of(_write_scene), ("scene.json",) * 3 + ("points.safetensors",
+               "views/00000.safetensors"), _read_scene),
+        Reader("checkpoint", _files_of(_write_checkpoint), ("step_00000003/record.json",) * 2
+               + ("step_00000003/state.safetensors",), _read_checkpoint),
+        Reader("weights", _files_of(_write_weights), ("a.safetensors", "b.pth"), _read_weights),
+        Reader("dataparser", _transform, ("dataparser_transforms.json",), _read_transform),
         Reader("truth", _files_of(_write_truth), ("depth.png", "normal.png", "objects.png", "diffuse.png"),
                _read_truth),
     )

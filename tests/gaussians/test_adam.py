@@ -282,3 +282,14 @@ def test_all_rates_fall_along_a_half_cosine_where_asked():
 def test_a_decay_beyond_the_run_is_refused():
     with pytest.raises(RtgsError, match=r"method\.optimizer\.decay_from=1\.5 must be between 0 and 1"):
         OptimizerSettings(decay_from=1.5)
+
+
+@pytest.mark.parametrize("what", ["values", "first", "second"])
+def test_a_tensor_that_could_only_be_moved_as_a_copy_is_refused(what: str):
+    surfels = surfels_of(5)
+    adam = GaussianAdam(surfels, SETTINGS, extent=1.0)
+    holder = surfels if what == "values" else getattr(adam, what)
+    holder.quaternions = holder.quaternions.detach().t().contiguous().t().requires_grad_(what == "values")
+    surfels.quaternions.grad = torch.ones(5, 4)
+    with pytest.raises(RuntimeError, match=rf"{what} of quaternions \(5, 4\) have the strides \(1, 5\)"):
+        adam.step(0)

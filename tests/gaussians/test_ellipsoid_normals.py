@@ -8,7 +8,7 @@ from surfel_cases import random_surfels
 from torch import Tensor
 
 from rtgs.gaussians.ellipsoids import Ellipsoids
-from rtgs.gaussians.normals import NORMAL_RESIDUAL, ellipsoid_normals, normal_residual_channel
+from rtgs.gaussians.normals import NORMAL_RESIDUAL, ellipsoid_normals, normal_residual_channel, two_sided_normals
 
 CENTER = torch.tensor([0.3, -0.2, -5.0], dtype=torch.float64)
 
@@ -134,3 +134,21 @@ def test_the_residual_as_a_channel_begins_without_effect():
     residual = made.activated(NORMAL_RESIDUAL)
     assert residual.shape == (40, 3)
     torch.testing.assert_close(ellipsoid_normals(made, CENTER, residual), ellipsoid_normals(made, CENTER))
+
+
+def test_two_sided_normals_face_the_camera_and_take_the_residual_of_its_side():
+    """Front: where the shortest axis points to; both sides of the same ellipsoids, and gradients."""
+    axes = torch.eye(3, dtype=torch.float64).expand(2, 3, 3)
+    sizes = torch.tensor([[2.0, 0.1, 1.0], [0.3, 0.5, 0.3]], dtype=torch.float64)  # shortest: y, and x of equals
+    means = torch.zeros(2, 3, dtype=torch.float64)
+    front, back = torch.full((2, 3), 0.25, dtype=torch.float64), torch.full((2, 3), -0.5, dtype=torch.float64)
+    near = torch.tensor([3.0, 3.0, 0.0], dtype=torch.float64)
+    for center, sign, residual in ((near, 1.0, front), (-near, -1.0, back)):
+        normals, used = two_sided_normals(axes, sizes, means, center, front, back)
+        expected = sign * axes[[0, 1], [1, 0]] + residual
+        torch.testing.assert_close(normals, expected / expected.norm(dim=1, keepdim=True))
+        assert torch.equal(used, residual)
+    given = [t.clone().requires_grad_() for t in (axes + 0.1, front, back)]
+    assert torch.autograd.gradcheck(lambda a, f, b: two_sided_normals(a, sizes, means, near, f, b), given)
+    with pytest.raises(ValueError, match=r"residuals must be \(2, 3\)"):
+        two_sided_normals(axes, sizes, means, near, front[:1], back)

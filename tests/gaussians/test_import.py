@@ -169,7 +169,7 @@ def packed_file(path: Path) -> None:
 
 
 def test_packed_splats_are_unpacked(tmp_path):
-    pytest.importorskip("gsply", reason="pip install 'rtgs[compressed]'")
+    pytest.importorskip("gsply", reason="pip install -e '.[compressed]'")
     packed_file(tmp_path / "a.compressed.ply")
     found = read_gaussians(tmp_path / "a.compressed.ply")
     assert type(found) is Ellipsoids
@@ -182,7 +182,7 @@ def test_without_its_reader_packed_splats_are_refused_with_the_way_out(tmp_path,
     packed_file(tmp_path / "a.compressed.ply")
     monkeypatch.setitem(sys.modules, "gsply", None)
     with pytest.raises(
-        RtgsError, match=r"pip install 'rtgs\[compressed\]'.*`splat-transform in\.compressed\.ply out\.ply`"
+        RtgsError, match=r"pip install -e '.\[compressed\]'.*`splat-transform in\.compressed\.ply out\.ply`"
     ):
         read_gaussians(tmp_path / "a.compressed.ply")
 
@@ -204,7 +204,7 @@ def real(name: str) -> Path:
 def test_a_real_file_and_its_compressed_original_agree():
     plain = read_gaussians(real("guitar.ply"))
     assert (len(plain), plain.sh_degree, type(plain)) == (90_854, 0, Ellipsoids)
-    pytest.importorskip("gsply", reason="pip install 'rtgs[compressed]'")
+    pytest.importorskip("gsply", reason="pip install -e '.[compressed]'")
     packed = read_gaussians(real("guitar.compressed.ply"))
     opaque = packed.opacity_logits > 6  # 255 of 255 has no logit: each decoder takes its own large one
     for (name, a), (_, b) in zip(plain.items(), packed.items()):

@@ -141,6 +141,7 @@ def test_pca_lays_discs_on_the_surface_of_the_points():
     assert float((third @ normal).abs().quantile(0.02)) > 0.999
     again = surfels_from_points(points, torch.rand(400, 3), settings, torch.Generator().manual_seed(1))
     assert torch.equal(made.quaternions, again.quaternions), "nothing is drawn"
+    assert all(tensor.is_contiguous() for _, tensor in made.items()), "or Adam would move copies"
 
 
 def test_pca_of_few_or_equal_points_stays_finite():

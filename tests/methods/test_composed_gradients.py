@@ -12,6 +12,8 @@ from torch import Tensor
 from rtgs.gaussians.materials import activate_materials
 from rtgs.gaussians.settings import MaterialSettings
 from rtgs.gaussians.surfels import activate
+from rtgs.light.cubemap import CubemapLight
+from rtgs.light.settings import EnvironmentSettings
 from rtgs.methods import Mode, Stage
 from rtgs.methods.model import Model
 from rtgs.methods.parts.kinds import surfel_options
@@ -39,7 +41,7 @@ class TwinRender:
     fragile: Tensor  # (H, W) bool: a decision lies within float32 rounding of its threshold
 
 
-def twin_render(method: Model, base, reflection, camera, images) -> TwinRender:
+def twin_render(method: Model, base, reflection, camera, images, texels=None) -> TwinRender:
     """What ``method.render`` computes, from float64 copies of both sets, by the readable twins alone."""
     settings = method.settings
     surfels = activate(base, camera.center, method.base.sh_degree(STEP))
@@ -80,6 +82,8 @@ def twin_render(method: Model, base, reflection, camera, images) -> TwinRender:
     color = traced.colors
     if settings.reflection.background == "mean":  # the same pixels as the method's
         color = color + (1 - traced.alpha[:, None]) * scene_color("mean", images).double()
+    if texels is not None:
+        color = color + (1 - traced.alpha[:, None]) * CubemapLight(texels, settings.environment)(mirrored.directions)
     change = torch.where(covered, specular_change(flat, weight * color.T, None), 0.0)
     image = (flat.diffuse + change).reshape(3, camera.height, camera.width)
     fragile = discontinuity_mask(*shape, features, camera, options=options).flatten()
@@ -106,6 +110,7 @@ CASES = {
     "dielectric": (OpticsSettings(fresnel="dielectric"), MaterialSettings(specular=0.3, f0=0.1, f0_channels=3)),
     "envgs": (OpticsSettings(weight="envgs"), MaterialSettings(specular=0.3)),
     "background": (OpticsSettings(weight="envgs"), MaterialSettings(specular=0.3)),
+    "cubemap": (OpticsSettings(weight="envgs"), MaterialSettings(specular=0.3)),
 }
 
 
@@ -113,9 +118,10 @@ CASES = {
 def test_image_and_every_gradient_are_those_of_the_twins(case: str):
     made = tiny()
     optics, materials = CASES[case]
-    background = "mean" if case == "background" else "black"
+    background = {"background": "mean", "cubemap": "cubemap"}.get(case, "black")
     quiet = recipe(propagation=PropagationSettings(every=0), background=background)
-    method = new_method(replace(quiet, optics=optics, materials=materials), made, schedule())
+    far = EnvironmentSettings(side=8, noise=1.0)
+    method = new_method(replace(quiet, optics=optics, materials=materials, environment=far), made, schedule())
     method.begin(Stage("reflection", 15, 60))
     generator = torch.Generator().manual_seed(4)
     with torch.no_grad():
@@ -125,7 +131,8 @@ def test_image_and_every_gradient_are_those_of_the_twins(case: str):
         method["base"].gaussians.log_scales += 0.3
     camera = made.scene.train[0].camera
     base, reflection = doubled(method.sets[0].gaussians), doubled(method.sets[1].gaussians)
-    twin = twin_render(method, base, reflection, camera, [view.image for view in made.scene.train])
+    texels = [group["texels"].detach().double().requires_grad_() for group in method.groups]
+    twin = twin_render(method, base, reflection, camera, [view.image for view in made.scene.train], *texels)
     rendered = method.render(camera, STEP, Mode.TRAIN)
     clear = ~twin.fragile
     assert float(clear.double().mean()) > 0.3
@@ -143,3 +150,8 @@ def test_image_and_every_gradient_are_those_of_the_twins(case: str):
             assert tensor.grad is not None, f"{part.name}.{name}"
             difference = (tensor.grad.double() - expected).norm() / expected.norm()
             assert float(difference) < 2e-3, f"{part.name}.{name}: {float(difference):.2g}"
+    for group, exact in zip(method.groups, texels, strict=True):
+        found = group["texels"].grad
+        assert found is not None
+        assert float((found.double() - exact.grad).norm() / exact.grad.norm()) < 2e-3
+    assert len(texels) == (case == "cubemap")

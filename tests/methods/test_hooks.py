@@ -7,15 +7,16 @@ from dataclasses import replace
 import pytest
 import torch
 from torch import Tensor
-from training_cases import small_method, small_scene, small_schedule
+from training_cases import named, small_method, small_scene, small_schedule
 
+from rtgs.gaussians.channels import Channel
+from rtgs.gaussians.surfels import ActivatedGaussians
 from rtgs.methods import MethodSpec, Mode, RenderedView, RenderOptions, Setup
 from rtgs.methods.family import DIFFUSE
 from rtgs.methods.model import Model
 from rtgs.methods.parts.base import BaseSet
 from rtgs.methods.parts.kinds import SURFELS
 from rtgs.methods.parts.part import Frame, Part
-from rtgs.scenes.scene import Scene
 from rtgs.train.parameters import ParameterGroup, Rate
 from rtgs.train.seeds import generator_for
 from rtgs.train.terms import LossTerm
@@ -56,15 +57,8 @@ class PerView(Part):
         return replace(shaded, image=gain * shaded.image, maps={**shaded.maps, "gain": gain})
 
 
-def named_scene() -> Scene:
-    """The small scene, its cameras with the names of their views, as importers give them."""
-    scene = small_scene()
-    views = (replace(view, camera=replace(view.camera, name=view.name)) for view in scene.train)
-    return replace(scene, train=tuple(views))
-
-
 def model(make_parts, terms=()) -> Model:
-    scene, settings, schedule = named_scene(), small_method("2dgs"), small_schedule(40)
+    scene, settings, schedule = named(small_scene()), small_method("2dgs"), small_schedule(40)
 
     def build(setup: Setup) -> Model:
         return Model(setup, (BaseSet(setup, SURFELS), *make_parts(scene)), terms)
@@ -95,7 +89,7 @@ def test_a_part_may_finish_a_view_by_its_name_and_train_it():
         return (PerView([view.camera.name for view in scene.train]),)
 
     method = model(parts, (LossTerm("gain", 1.0, bright),))
-    scene = named_scene()
+    scene = named(small_scene())
     Trainer(method, scene, seed=1).run()
     (group,) = method.groups
     gains = group["gain"].detach()  # type: ignore[index]
@@ -107,3 +101,30 @@ def test_a_part_may_finish_a_view_by_its_name_and_train_it():
     assert float(by_name.maps["gain"]) == float(gains[0])
     assert float(by_mean.maps["gain"]) == pytest.approx(float(gains.mean()))
     torch.testing.assert_close(by_name.image / gains[0], by_mean.image / gains.mean())
+
+
+def test_a_part_may_say_what_is_composited_of_the_base_set():
+    """Half of every colour, and a fourth column that a channel which is no column of its own makes."""
+
+    class Half(Part):
+        name = "half"
+
+        def __init__(self, base: BaseSet) -> None:
+            self.base = base
+
+        def paint(self, frame: Frame, rows: ActivatedGaussians) -> Tensor:
+            glow = self.base.set.gaussians.activated("glow").mean(1, keepdim=True)
+            return torch.cat((0.5 * rows.colors, glow), dim=1)
+
+    plain = model(lambda scene: ())
+    painted = model(lambda scene: ())
+    glow = Channel("glow", 0.7, "identity", shape=(48,), rate=0.1, bounds=(-9.0, 9.0), composited=False)
+    painted.base.set.adopt(painted.base.set.gaussians.with_channels(glow))
+    painted.base.painter = Half(painted.base)
+    camera = small_scene().train[0].camera
+    found, expected = (each.render(camera, 0, Mode.EVALUATE) for each in (painted, plain))
+    assert found.buffers.features.shape[0] == 4
+    torch.testing.assert_close(found.image, 0.5 * expected.image)
+    torch.testing.assert_close(found.buffers.features[3], 0.7 * found.buffers.alpha)
+    painted.base.painter = None
+    assert torch.equal(painted.render(camera, 0, Mode.EVALUATE).image, expected.image), "no column of its own"

@@ -48,12 +48,14 @@ def test_every_method_renders_and_lowers_its_loss(name: str):
         last, _ = train_step(method, scene, step)
     assert float(last.total.detach()) < 0.8 * float(first.total.detach())
     reflective = (Stage("diffuse", 0, 3), Stage("reflection", 3, 60))
-    assert method.stages == (reflective if name in ("envgs", "rtgs", "rtgs_printed") else (Stage("diffuse", 0, 60),))
+    alone = {"2dgs": "diffuse", "3dgs": "diffuse", "gaussian_shader": "shading"}
+    assert method.stages == ((Stage(alone[name], 0, 60),) if name in alone else reflective)
     assert find_method(name).timeline(method.settings, method.schedule) == method.stages
 
 
 def test_an_unknown_method_is_refused_with_the_known_ones():
-    with pytest.raises(ValueError, match=r"method\.name is '3dgz': choose one of 2dgs, 3dgs, envgs, rtgs"):
+    known = "2dgs, 3dgs, 3dgs_dr, gaussian_shader, ref_gaussian, ref_gs, envgs, rtgs"
+    with pytest.raises(ValueError, match=rf"method\.name is '3dgz': choose one of {known}"):
         make(replace(small_method(), name="3dgz"))
 
 

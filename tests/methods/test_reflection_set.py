@@ -7,14 +7,15 @@ from dataclasses import replace
 
 import pytest
 import torch
-from reflective_cases import new_method, recipe, schedule, tiny
+from reflective_cases import new_method, recipe, schedule, tiny, train_step
 
 from rtgs.config import compose
-from rtgs.gaussians.settings import DensitySettings
+from rtgs.gaussians.ellipsoids import Ellipsoids
+from rtgs.gaussians.settings import DensitySettings, InitSettings
 from rtgs.gaussians.surfels import activate
 from rtgs.methods import Mode, Stage
 from rtgs.methods.parts.propagation import propagate_normals
-from rtgs.methods.parts.reflection_init import reflection_surfels
+from rtgs.methods.parts.reflection_init import copied_surfels, reflection_surfels
 from rtgs.methods.parts.traced_set import FollowingTree, trace_set
 from rtgs.methods.settings import PropagationSettings, ReflectionSettings
 from rtgs.render.buffers import TraceOptions
@@ -152,3 +153,49 @@ def test_a_propagation_disturbs_the_colours_of_matte_surfels_alone():
     torch.testing.assert_close(grown, expected)
     opaque = before.opacity_logits.sigmoid().clamp_min(settings.opacity)
     torch.testing.assert_close(after.opacity_logits.sigmoid(), opaque)
+
+
+@pytest.mark.parametrize("name", ["envgs", "rtgs"])
+def test_it_may_begin_as_a_copy_of_the_base_set(name: str):
+    """Then it goes its own way: nothing of one is the other, and a resumed run ends the same."""
+    made = tiny()
+    method, other = (new_method(recipe(name, init_from="base"), made, schedule()) for _ in range(2))
+    (event,) = [each for each in method.begin(Stage("reflection", 15, 60)) if each.kind == "begin"]
+    base, reflection = method["base"].gaussians, method["reflection"].gaussians
+    assert event.detail == f"{len(base)} surfels of the base set"
+    assert reflection.channels == ()
+    for each in reflection.names:
+        assert torch.equal(reflection[each], base[each]), each
+        assert reflection[each].data_ptr() != base[each].data_ptr(), each
+    for step in range(15, 24):
+        train_step(method, made, step)
+    assert not torch.equal(method["reflection"].gaussians.opacity_logits, method["base"].gaussians.opacity_logits)
+    other.load({key: tensor.clone() for key, tensor in method.state().items()})
+    for step in range(24, 36):
+        train_step(method, made, step)
+        train_step(other, made, step)
+    expected, found = method.state(), other.state()
+    assert [key for key in expected if not torch.equal(found[key], expected[key])] == []
+
+
+def test_a_copy_is_of_the_most_opaque_and_of_the_sets_own_degree():
+    made = tiny()
+    base = new_method(recipe(), made, schedule())["base"].gaussians
+    with torch.no_grad():
+        base.opacity_logits[:] = torch.arange(float(len(base))) / 100
+        base.opacity_logits[7] = 9.0
+    copied = copied_surfels(base, 20, 1)
+    assert torch.equal(copied.means, base.means.detach()[[7, *range(len(base) - 19, len(base))]])
+    assert (copied.sh_degree, copied.sh_rest.shape) == (1, (20, 3, 3))
+    wider = copied_surfels(copied, 20, 3)
+    assert wider.sh_degree == 3
+    assert torch.equal(wider.sh_rest[:, :3], copied.sh_rest)
+    assert not wider.sh_rest[:, 3:].any()
+    few = DensitySettings(max_surfels=30)
+    method = new_method(recipe(init_from="base", init=InitSettings(sh_degree=0), density=few), made, schedule())
+    method.begin(Stage("reflection", 15, 60))
+    assert len(method["reflection"]) == 30
+    assert method["reflection"].gaussians.sh_degree == 0
+    thick = Ellipsoids(*(torch.zeros(2, *shape) for shape in ((3,), (3,), (4,), (), (3,), (0, 3))))
+    with pytest.raises(TypeError, match="init_from=base"):
+        copied_surfels(thick, 5, 0)

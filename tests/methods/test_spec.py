@@ -8,6 +8,7 @@ from dataclasses import fields, replace
 
 import pytest
 
+from rtgs.core.errors import RtgsError
 from rtgs.methods import MethodSpec, StageSpec, find_method, is_own, method_names, own_methods
 from rtgs.methods.family import DIFFUSE, REFLECTION, TRANSMITTANCE
 from rtgs.methods.settings import MethodSettings, ReflectionSettings, TransmittanceSettings
@@ -61,7 +62,7 @@ def test_what_a_method_declares_is_checked():
         MethodSpec("keyless", (DIFFUSE, replace(REFLECTION, start_key="")), unbuilt)
     with pytest.raises(ValueError, match="two stages of one name: diffuse, diffuse"):
         MethodSpec("twice", (DIFFUSE, replace(DIFFUSE, start_key="method.a")), unbuilt)
-    with pytest.raises(ValueError, match="has fog: known are surface, mirror, microfacet, glass"):
+    with pytest.raises(ValueError, match="has fog: known are harmonics, surface, mirror, microfacet, glass"):
         MethodSpec("foggy", (DIFFUSE,), unbuilt, frozenset({"fog"}))
     with pytest.raises(ValueError, match="method 2dgs has no stage 'reflection': it has diffuse"):
         find_method("2dgs").stage("reflection")
@@ -76,9 +77,20 @@ def test_a_method_of_one_stage_may_read_all_its_settings():
 
 
 def test_the_methods_of_this_package():
-    assert method_names()[:5] == ("2dgs", "3dgs", "envgs", "rtgs", "rtgs_printed")
+    own = (
+        "2dgs",
+        "3dgs",
+        "3dgs_dr",
+        "gaussian_shader",
+        "ref_gaussian",
+        "ref_gs",
+        "envgs",
+        "rtgs",
+        "rtgs_printed",
+    )
+    assert method_names()[: len(own)] == own
     assert all(is_own(spec) for spec in own_methods())
-    assert [spec.object_stage(settings(0.3)) for spec in own_methods()] == [None] * 3 + [TRANSMITTANCE] * 2
+    assert [spec.object_stage(settings(0.3)) for spec in own_methods()] == [None] * 7 + [TRANSMITTANCE] * 2
     assert find_method("rtgs").object_stage(settings(0.3, enabled=False)) is None
 
 
@@ -114,6 +126,13 @@ def test_a_weight_that_no_stage_reads_is_told():
     assert unread("envgs", **everything, specular_start=0.5) == [f"{late}, let it start earlier", depth]
     assert unread("envgs", **everything, specular_start=0.1) == [depth]
     assert unread("rtgs", **everything) == []
+    for method in ("3dgs_dr", "ref_gs", "ref_gaussian"):
+        names = [text.split("=")[0].split(".")[-1] for text in unread(method, **everything, specular_start=0.1)]
+        assert names == ["perceptual", "specular", "transmission_depth"]
+        reads = find_method(method).stage("reflection").reads
+        asked = LossSettings(perceptual=0.02, perceptual_start=0.1, specular=0.2, specular_start=0.1)
+        one, other = (reads(MethodSettings(name=method, loss=loss)) for loss in (asked, LossSettings()))
+        assert one == other == reads(one)
 
 
 def test_a_weight_that_is_off_or_the_default_is_not_told():
@@ -129,3 +148,17 @@ def test_the_weights_of_losses_are_known():
     shares = ("_start", "_gain", "_masked", "_target")
     numbers = [each.name for each in fields(LossSettings) if each.type == "float" and not each.name.endswith(shares)]
     assert tuple(numbers) == LOSS_WEIGHTS
+
+
+def test_pictures_of_another_program_are_a_method_that_trains_nothing():
+    external = find_method("external")
+    assert (external.stages, external.elsewhere) == ((), True)
+    assert external.name not in method_names()
+    assert external not in own_methods()
+    assert external.unread_losses(settings(0.3)) == ()
+    with pytest.raises(RtgsError, match="method=external trains nothing"):
+        external.build(None)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="its pictures come from elsewhere, so it has no stages"):
+        replace(external, stages=(StageSpec("a"),))
+    with pytest.raises(ValueError, match="its first stage must start at once"):
+        replace(external, elsewhere=False)

@@ -23,7 +23,14 @@ from rtgs.optics.microfacet import (
     specular_weights,
 )
 from rtgs.optics.settings import Masking, OpticsSettings, Remap, Weight
-from rtgs.optics.split_sum import SMALLEST_COSINE, WIDEST, lobe_factors, split_sum_factors, split_sum_table
+from rtgs.optics.split_sum import (
+    SMALLEST_COSINE,
+    WIDEST,
+    lobe_factors,
+    split_sum_factors,
+    split_sum_table,
+    split_sum_weight,
+)
 
 DEFAULT = OpticsSettings()
 EVERY_SETTING = [
@@ -264,3 +271,19 @@ def test_settings_that_mean_nothing_are_refused_by_their_key(change: dict, messa
 
 def test_width_without_remap_is_the_roughness():
     assert torch.equal(microfacet_width(f64(0.0, 0.3), OpticsSettings(remap="none")), f64(1e-3, 0.3))
+
+
+def test_the_split_sum_weight_is_that_of_its_factors_and_finite_at_the_ends():
+    generator = torch.Generator().manual_seed(5)
+    cosine, roughness = torch.rand(2, 40, generator=generator, dtype=torch.float64)
+    reflectance = torch.rand(3, 40, generator=generator, dtype=torch.float64)
+    scale, offset = split_sum_factors(cosine, roughness.square())
+    torch.testing.assert_close(split_sum_weight(cosine, roughness, reflectance), reflectance * scale + offset)
+    given = [t.clone().requires_grad_() for t in (cosine.clamp(0.1, 0.9), roughness.clamp(0.1, 0.9), reflectance)]
+    assert torch.autograd.gradcheck(split_sum_weight, given, atol=1e-6)
+    ends = [torch.tensor([-0.5, 0.0, 1.0, 1.5]), torch.tensor([0.0, 0.0, 1.0, 1.0]), torch.ones(3, 4)]
+    ends = [t.requires_grad_() for t in ends]
+    weight = split_sum_weight(*ends)
+    assert float(weight.detach().max()) <= 1 + 1e-6, "white walls reflect no more than they get"
+    weight.sum().backward()
+    assert all(bool(torch.isfinite(t.grad).all()) for t in ends)

@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from rtgs.config.names import overridden
+
 WIDTH, HEIGHT, VIEWS = 32, 24, 10
 QUICK = (
     "preset=smoke",
@@ -23,6 +25,8 @@ QUICK = (
     "tracking=off",
     "threads=1",
 )
+NAMED = f"-{overridden(QUICK)}"
+"""What they add to a run's name."""
 
 
 def pose(index: int) -> list[list[float]]:

@@ -9,12 +9,12 @@ import pytest
 
 from pipelines.planning.graph import RunGraph, build_graph
 from pipelines.steps.train import train_step
-from pipelines.steps.training import StageParams
 from rtgs.config import compose
 from rtgs.methods import find_method
 from rtgs.methods.settings import MethodSettings
 from rtgs.pretrained import weights
 from rtgs.pretrained.weights import LPIPS_VGG, VGG16
+from rtgs.runs.training import StageParams
 from rtgs.train.settings import LossSettings
 from rtgs.workflow import InlineExecutor, Store, make_plan
 from rtgs.workflow.engine import WorkerJob, run_step

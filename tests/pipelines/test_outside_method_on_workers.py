@@ -13,11 +13,12 @@ from app_cases import QUICK, _in_root, capture, root  # noqa: F401  (fixtures)
 from safetensors.torch import load_file
 
 from pipelines.planning.graph import RunGraph, build_graph
-from pipelines.steps.training import load_method, read_summary
-from pipelines.steps.views import read_render
+from pipelines.steps.training import read_summary
 from rtgs.config import compose
 from rtgs.methods import Mode
 from rtgs.methods.model import Model
+from rtgs.runs.training import load_method
+from rtgs.runs.views import read_render
 from rtgs.scenes.canonical import read_scene
 from rtgs.workflow import InlineExecutor, Store, make_plan
 from rtgs.workflow.engine import DaskExecutor, EngineSettings, WorkerJob, open_client

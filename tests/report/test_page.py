@@ -4,6 +4,7 @@ import base64
 import io
 import math
 import re
+import shutil
 import warnings
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -19,6 +20,7 @@ from rtgs.core.decisions import Decision
 from rtgs.evaluate.records import METRICS, EvaluationTable, RunFacts, ViewScore
 from rtgs.mesh.triangles import TriangleMesh
 from rtgs.report.figures import Curve, curve_svg, depth_picture, image_bytes, mesh_picture, normal_picture, outlined
+from rtgs.report.files import link_files
 from rtgs.report.page import (
     PICTURE_STEPS,
     TARGET_BYTES,
@@ -106,6 +108,7 @@ def full_data() -> ReportData:
         config=config_lines({"loss.normal": 0.04, "seed": 0}, {"loss.normal": 0.05, "seed": 0}),
         machine={"threads": "2", "instruction set": "avx2"},
         mesh=MeshFigure(np.full((20, 30, 3), 90, np.uint8), 1234, 2345, "TSDF"),
+        environment=np.full((16, 32, 3), 60, np.uint8),
     )
 
 
@@ -129,7 +132,9 @@ def test_page_is_self_contained(tmp_path: Path) -> None:
     namespaces = {"http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"}  # names, never fetched
     assert set(re.findall(r"https?://[\w./-]+", page)) <= namespaces
     pictures = [address for address in parsed.addresses if address.startswith("data:image/jpeg")]
-    assert len(pictures) == 2 * 7 + 1  # photo, render, error, FLIP, depth, normal, alpha for two views, and the mesh
+    assert (
+        len(pictures) == 2 * 7 + 2
+    )  # photo, render, error, FLIP, depth, normal, alpha of two views; mesh, environment
     with Image.open(io.BytesIO(base64.b64decode(pictures[0].split(",")[1]))) as picture:
         assert picture.size == (48, 32)
 
@@ -150,11 +155,27 @@ def test_page_shows_the_figures_and_the_reasons() -> None:
     assert "instruction set" in text
 
 
+def test_what_training_views_show_and_the_noise_floor_stand_beside_the_mean() -> None:
+    known = table(1)
+    rows = (replace(known.rows[0], values=known.rows[0].values | {"psnr_framed": 23.456, "framed_share": 0.875}),)
+    known = replace(known, facts=replace(known.facts, noise_psnr=40.43), rows=rows)
+    framed = torch.full((32, 48), 12)
+    framed[:, :6] = 2
+    view = replace(report_view("view_0.jpg"), framed=framed)
+    page = render_report(ReportData("known", known, views=(view,)))
+    text = " ".join(" ".join(outline(page).text).split())
+    assert "PSNR where three views look 23.46 dB 87.5 % of the pixels" in text
+    assert "Noise floor 40.43 dB of the test photos themselves" in text
+    assert "Coverage" in text
+    assert "fewer than 3" in text
+
+
 def test_optional_parts_leave_no_trace() -> None:
     page = render_report(ReportData("bare", table(1)))
     headings = re.findall(r"<h2>(.*?)</h2>", page)
     assert headings == ["Every test view", "What was run"]
-    assert "PSNR in mask" not in page
+    for absent in ("PSNR in mask", "PSNR where three views look", "Noise floor", "Coverage"):
+        assert absent not in page
 
 
 def test_everything_is_escaped() -> None:
@@ -316,3 +337,31 @@ def test_layers_stand_beside_their_truth() -> None:
     assert page.count("Enlarge Reflection, rendered") == page.count("Enlarge Reflection, truth") == 1
     assert "Enlarge Roughness, truth" not in page
     assert "sRGB encoded" in " ".join(outline(page).text)
+
+
+def test_links_lead_to_what_lies_beside_the_page_and_are_renewed(tmp_path: Path) -> None:
+    page = tmp_path / "report.html"
+    write_report(page, full_data())
+    whole = page.read_bytes()
+    link_files(page)
+    assert page.read_bytes() == whole  # alone: no link
+    (tmp_path / "point_cloud.ply").write_bytes(bytes(200_000))
+    (tmp_path / "shown" / "a & b").mkdir(parents=True)
+    (tmp_path / "shown" / "a & b" / "film.mp4").write_bytes(b"film")
+    link_files(page)
+    found = outline(page.read_text(encoding="utf-8"))
+    assert [each for each in found.addresses if not each.startswith("data:")] == [
+        "point_cloud.ply",
+        "shown/a%20%26%20b/film.mp4",
+    ]
+    assert "base set, 0.2 MB" in " ".join(found.text)
+    (tmp_path / "point_cloud.ply").unlink()
+    shutil.rmtree(tmp_path / "shown")
+    link_files(page)
+    assert page.read_bytes() == whole
+
+
+def test_charts_say_what_they_are() -> None:
+    svgs = re.findall(r"<svg [^>]*>", render_report(full_data()))
+    assert len(svgs) == 3
+    assert all('role="img"' in svg and 'aria-label="' in svg for svg in svgs)

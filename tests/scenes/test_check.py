@@ -107,6 +107,21 @@ def test_cameras_and_lenses_far_apart_in_scale(tmp_path):
     assert "surfels start from random points" in text
 
 
+def test_a_capture_far_from_the_origin_is_mentioned(tmp_path):
+    """Such as one in map coordinates: float32 blurs it (docs/numerics.md)."""
+    root = write_transforms(tmp_path)
+
+    def moved(content: dict, by: float) -> None:
+        for frame in content["frames"]:
+            frame["transform_matrix"][0][3] += by
+
+    edit_transforms(root, lambda content: moved(content, 100.0))
+    assert "from the origin" not in messages(check_capture(SceneSettings(path=str(root))))
+    edit_transforms(root, lambda content: moved(content, 400_000.0))
+    text = messages(check_capture(SceneSettings(path=str(root))), "warning")
+    assert re.search(r"the cameras stand 4e\+05 from the origin, \d+ times their distance to each other", text)
+
+
 def test_transparent_photos_and_mixed_sizes_are_mentioned(tmp_path):
     root = ColmapCapture(tmp_path, points=120).write()
     rgba = np.dstack([pinhole_picture(), np.ones((HEIGHT, WIDTH))])

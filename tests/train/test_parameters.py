@@ -50,7 +50,17 @@ def test_a_rate_decays_exponentially_after_its_start():
     assert Rate(0.3).at(10**6) == 0.3
 
 
-@pytest.mark.parametrize("numbers", [{"initial": 0.0}, {"initial": math.nan}, {"initial": 1.0, "steps": 0}])
+def test_a_rate_rises_in_a_straight_line_while_it_warms_up():
+    rate, without = Rate(0.1, final=0.001, steps=20, start=5, warm_up=4), Rate(0.1, final=0.001, steps=20, start=5)
+    assert rate.at(4) == 0.0
+    assert [rate.at(step) / without.at(step) for step in (5, 6, 7, 8, 9)] == pytest.approx([0.25, 0.5, 0.75, 1, 1])
+    assert Rate(0.4, warm_up=2).at(0) == 0.2
+
+
+BAD = [{"initial": 0.0}, {"initial": math.nan}, {"initial": 1.0, "steps": 0}, {"initial": 1.0, "warm_up": -1}]
+
+
+@pytest.mark.parametrize("numbers", BAD)
 def test_rates_that_mean_nothing_are_refused(numbers: dict):
     with pytest.raises(ValueError, match="rate"):
         Rate(**numbers)
@@ -92,6 +102,20 @@ def test_a_state_goes_on_to_the_bit():
 
 
 KINDS = ("values", "adam.first", "adam.second")
+
+
+def test_tensors_of_another_layout_train_alike():
+    values = tensors()
+    plain = ParameterGroup("group", values, Rate(0.01))
+    turned = values | {"map": values["map"].transpose(0, 2).contiguous().transpose(0, 2)}
+    assert not turned["map"].is_contiguous()
+    other = ParameterGroup("group", turned, Rate(0.01))
+    for step in range(3):
+        for group in (plain, other):
+            give_gradients(dict(group.tensors()), step)
+            group.step(step)
+    for name, value in plain.state().items():
+        assert torch.equal(other.state()[name], value), name
 
 
 def test_a_state_of_another_shape_or_without_a_tensor_is_refused():

@@ -52,3 +52,11 @@ def test_lines_come_at_most_every_few_seconds_and_at_the_end():
     lines.close()
     assert len(stream.getvalue().splitlines()) == 1
     assert stream.getvalue().startswith("diffuse: step 3/3  loss 0.5000  PSNR 10.00 dB  7 Gaussians")
+
+
+def test_the_psnr_of_a_test_view_stands_beside_that_of_training():
+    stream = io.StringIO()
+    lines = LineProgress(stream, seconds=0)
+    lines.start("diffuse", 0, 3)
+    lines.advance(StepReport(3, 0.5, 10.0, 7, 22.79))
+    assert "PSNR 10.00 dB, of a test view 22.79 dB  7 Gaussians" in stream.getvalue()

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,8 @@ import torch
 from safetensors.torch import load_file
 from training_cases import small_method, small_schedule, small_trainer
 
+from rtgs.core.cameras import Camera
+from rtgs.gaussians.settings import InitSettings, Orientation
 from rtgs.train.checkpoint import CheckpointError, checkpoint_path
 
 TOTAL = 60
@@ -135,6 +138,43 @@ def test_the_numbers_shown_to_the_user_go_on_too(tmp_path: Path):
     assert resumed.resumed_from == 30
     assert (resumed.loss, resumed.psnr_train) == (straight.loss, straight.psnr_train)
     assert resumed.psnr_test == straight.psnr_test
+
+
+@pytest.mark.parametrize("orientation", ["published", "pca"])
+@pytest.mark.parametrize("at", [3, 6])
+def test_killed_before_the_first_change_of_rows(tmp_path: Path, orientation: Orientation, at: int):
+    """Until then tensors are those that the start made, after it those of a checkpoint: the same bits by either."""
+    settings = replace(small_method(), init=InitSettings(orientation=orientation))
+    schedule = small_schedule(12, checkpoint_every=3)
+    straight, killed = tmp_path / "straight", tmp_path / "killed"
+    small_trainer(settings=settings, schedule=schedule, checkpoint_dir=straight).run()
+    trainer = small_trainer(settings=settings, schedule=schedule, checkpoint_dir=killed)
+    before_step = trainer.method.render
+
+    def interrupted(camera: Camera, step: int, *arguments, **options):
+        if step == at:
+            raise KeyboardInterrupt
+        return before_step(camera, step, *arguments, **options)
+
+    trainer.method.render = interrupted  # type: ignore[method-assign]
+    with pytest.raises(KeyboardInterrupt):
+        trainer.run()
+    again = small_trainer(settings=settings, schedule=schedule, checkpoint_dir=killed).run()
+    assert again.resumed_from == at
+    found, expected = (load_file(checkpoint_path(folder, 12) / "state.safetensors") for folder in (killed, straight))
+    assert_same(found, expected)
+
+
+@pytest.mark.parametrize("orientation", ["published", "pca"])
+def test_every_parameter_of_a_new_set_moves(orientation: Orientation):
+    trainer = small_trainer(
+        settings=replace(small_method(), init=InitSettings(orientation=orientation)), schedule=small_schedule(3)
+    )
+    first, *_ = trainer.method.sets
+    before = {name: tensor.detach().clone() for name, tensor in first.tensors()}
+    trainer.run()
+    still = [name for name, tensor in first.tensors() if torch.equal(tensor, before[name])]
+    assert still == ["sh_rest"], "its bands come later"
 
 
 def test_a_truncated_newest_checkpoint_costs_time_but_not_exactness(tmp_path: Path, uninterrupted):

@@ -9,6 +9,7 @@ import torch
 from training_cases import small_method, small_scene, small_schedule
 
 from rtgs.gaussians.settings import OptimizerSettings
+from rtgs.light.settings import EnvironmentSettings
 from rtgs.mesh.container import ObjectMesh
 from rtgs.methods import create_method
 from rtgs.methods.model import Model
@@ -46,7 +47,16 @@ def method_of(name: str) -> MethodSettings:
     settings = replace(small_method(name), optimizer=violent(30))
     if name in ("2dgs", "3dgs"):
         return settings
+    if name == "ref_gaussian":  # three levels, a mesh every tenth of the run
+        cubemap = EnvironmentSettings(side=32, mips="ggx", levels=(32, 16, 16), rate=0.3)
+        settings = replace(settings, environment=cubemap, own={"mesh_cells": 64, "smooth": 0.45})
+    if name == "ref_gs":
+        fast = replace(settings.environment, rate=0.06)
+        settings = replace(settings, environment=fast, own={"network_rate": 0.015, "scope_radius": 0.8})
     reflection = replace(settings.reflection, matte=MatteSettings(probation=0.0), cells=6)
+    if name == "gaussian_shader":
+        fast = replace(settings.environment, rate=0.5)
+        return replace(settings, environment=fast, own={"shared_rate": True})
     optics = OpticsSettings(weight="envgs") if name == "envgs" else OpticsSettings(max_gain=0.0)
     glass = replace(settings.transmittance, opaque_share=1.0, cells=6)
     loss = replace(settings.loss, specular=0.2, transmission_depth=0.2)
@@ -61,7 +71,9 @@ def test_every_rate_is_one_of_those_that_are_raised():
     assert {"specular_logits", "roughness_logits", "f0_logits"} < raised
 
 
-@pytest.mark.parametrize("name", ["2dgs", "3dgs", "envgs", "rtgs", "rtgs_printed"])
+@pytest.mark.parametrize(
+    "name", ["2dgs", "3dgs", "3dgs_dr", "gaussian_shader", "ref_gaussian", "ref_gs", "envgs", "rtgs", "rtgs_printed"]
+)
 def test_2000_steps_at_30_times_the_learning_rates_on_noise_stay_finite(name: str):
     """All stages of a method: glass with an interface and a bounded weight in rtgs, without either as printed."""
     three_stages = name.startswith("rtgs")
@@ -79,7 +91,8 @@ def test_2000_steps_at_30_times_the_learning_rates_on_noise_stay_finite(name: st
         trainer.run()  # the guard stops at any non-finite loss or gradient
     assert method.stages[-1].until == STEPS
     assert [stage.name for stage in method.stages][1:] == ["reflection", "transmittance"][: len(method.stages) - 1]
-    assert len(method.stages) == {"2dgs": 1, "3dgs": 1, "envgs": 2}.get(name, 3)
+    counts = {"2dgs": 1, "3dgs": 1, "3dgs_dr": 2, "gaussian_shader": 1, "ref_gaussian": 2, "ref_gs": 2, "envgs": 2}
+    assert len(method.stages) == counts.get(name, 3)
     assert (method.find("transmittance") is not None) == three_stages
     for part in method.sets:
         _within_limits(part.gaussians, settings.optimizer, scene.extent, part.name)

@@ -16,7 +16,7 @@ from rtgs.train.checkpoint import load_newest
 from rtgs.train.guard import TrainingDiverged
 from rtgs.train.progress import LineProgress, StepReport
 from rtgs.train.settings import LossSettings
-from rtgs.train.trainer import scene_digest
+from rtgs.train.trainer import Trainer, scene_digest
 
 
 class Memory:
@@ -183,3 +183,33 @@ def test_scene_digest_tells_images_normals_cameras_and_points():
     }
     assert len(digests) == 6
     assert scene_digest(scene) == scene_digest(small_scene())
+
+
+def test_a_stage_that_follows_another_says_nothing_of_being_resumed(tmp_path):
+    """Its start is the checkpoint of the stage before; one further on is another matter."""
+    from rtgs.train.method import Stage
+    from rtgs.train.progress import SilentProgress
+
+    class Notes(SilentProgress):
+        def __init__(self) -> None:
+            self.lines: list[str] = []
+
+        def note(self, text: str) -> None:
+            self.lines.append(text)
+
+    def notes_of(*stretch: int) -> list[str]:
+        notes = Notes()
+        trainer = small_trainer(schedule=small_schedule(40), checkpoint_dir=tmp_path, progress=notes)
+        Trainer(
+            trainer.method,
+            trainer.scene,
+            seed=3,
+            stage=Stage("diffuse", *stretch),
+            progress=notes,
+            checkpoint_dir=tmp_path,
+        ).run()
+        return [line for line in notes.lines if "resumed" in line]
+
+    assert notes_of(0, 20) == []
+    assert notes_of(20, 40) == []
+    assert notes_of(0, 40) == ["resumed from the checkpoint of step 40"]

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 
 from rtgs.core.cameras import Camera
 from rtgs.gaussians.settings import DensitySettings
+from rtgs.light.settings import EnvironmentSettings
 from rtgs.methods import create_method
 from rtgs.methods.settings import MethodSettings
 from rtgs.scenes.scene import Scene, View
@@ -56,6 +58,15 @@ def small_scene(views: int = 6, *, noise: bool = False, normals: bool = False, p
     )
 
 
+def named(scene: Scene) -> Scene:
+    """The scene, its cameras with the names of their views, as importers give them."""
+
+    def of(views: tuple[View, ...]) -> tuple[View, ...]:
+        return tuple(replace(view, camera=replace(view.camera, name=view.name)) for view in views)
+
+    return replace(scene, train=of(scene.train), test=of(scene.test), held=of(scene.held))
+
+
 def small_schedule(total: int = 60, **changes: int) -> ScheduleSettings:
     values = dict(
         total=total, sh_every=20, densify_from=5, densify_until=45, densify_every=20, opacity_reset_every=40,
@@ -65,9 +76,16 @@ def small_schedule(total: int = 60, **changes: int) -> ScheduleSettings:
 
 
 def small_method(name: str = "2dgs") -> MethodSettings:
+    plain = name.startswith("3dgs") or name == "gaussian_shader"
+    light = EnvironmentSettings()
+    if name == "gaussian_shader":
+        light = EnvironmentSettings(side=16, mips="ggx", levels=(16, 8, 8), activation="identity", initial=0.8, noise=0)
+    if name == "ref_gs":
+        light = EnvironmentSettings(side=16, noise=0.0, rate=0.002)
     return MethodSettings(
         name=name,
-        loss=LossSettings(normal=0.0) if name == "3dgs" else LossSettings(normal_start=0.25, mono_normal=0.01),
+        loss=LossSettings(normal=0.0) if plain else LossSettings(normal_start=0.25, mono_normal=0.01),
+        environment=light,
         density=DensitySettings(gradient_threshold=5e-5, max_surfels=1200),
     )
 

@@ -157,7 +157,10 @@ def test_a_step_that_kills_its_workers_is_given_up(tmp_path, monkeypatch):
         outcomes = DaskExecutor(client, WorkerJob(str(store.root), 1)).attempt(make_plan([deadly], store))
     assert not worker_environment(1).keys() & os.environ.keys(), "Dask sets a worker's environment here"
     assert [failure.step for failure in outcomes.failures] == ["deadly"]
-    assert "KilledWorker" in outcomes.failures[0].problem
+    problem = outcomes.failures[0].problem
+    assert "KilledWorker: 1 workers were killed at it, the last one tcp://127.0.0.1" in problem
+    assert "for want of memory" in problem
+    assert "goes on from its last checkpoint" in problem
 
 
 def _die(params: ToyParams, context: object) -> None:

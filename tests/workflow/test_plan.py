@@ -9,7 +9,7 @@ from toy import ToyParams, graph, train
 from rtgs.core.errors import RtgsError
 from rtgs.workflow import InlineExecutor, Step, Store, make_plan
 from rtgs.workflow.manifest import describe
-from rtgs.workflow.plan import Neighbours, differences, topological
+from rtgs.workflow.plan import NEW_INPUT, Neighbours, differences, topological
 
 
 @pytest.fixture
@@ -109,3 +109,28 @@ def test_planning_a_thousand_cached_steps_is_quick(tmp_path):
     plan = make_plan(steps, store)
     assert plan.complete
     assert time.process_time() - start < 2.0
+
+
+def test_a_new_capture_is_not_compared_with_another_one(tmp_path, store):
+    """Neither are the steps that build on it; an edited capture of the same name is."""
+
+    def steps(capture: str, name: str, value: float = 0.1) -> list[Step]:
+        recipe = make_dataclass("Recipe", [("capture", str), ("settings", object)], frozen=True)
+        naming = make_dataclass("Naming", [("name", str)], frozen=True)
+        first = Step("read", 1, recipe(capture, naming(name)), write_nothing)
+        return [
+            first,
+            Step("learn", 1, make_dataclass("Own", [("value", float)], frozen=True)(value), write_nothing, (first,)),
+        ]
+
+    InlineExecutor(store).execute(make_plan(steps("aa", "fox"), store))
+    assert [each.reason for each in make_plan(steps("bb", "cat"), store)] == [NEW_INPUT, NEW_INPUT]
+    assert [each.reason for each in make_plan(steps("bb", "fox"), store)] == [
+        "capture: aa -> bb",
+        "upstream read changed",
+    ]
+    assert [each.reason for each in make_plan(steps("aa", "fox", 0.2), store)] == ["", "value: 0.1 -> 0.2"]
+
+
+def write_nothing(params, context) -> None:
+    (context.out / "result.txt").write_text("")

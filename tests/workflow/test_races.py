@@ -11,7 +11,7 @@ from pathlib import Path
 
 import toy
 
-from rtgs.workflow import Store, make_plan
+from rtgs.workflow import InlineExecutor, Store, make_plan
 
 IDEAL = ["geom from 0", "prep", "train 0.1", "train 0.2", "train 0.3"]
 
@@ -37,7 +37,7 @@ def test_processes_at_once_share_the_work(tmp_path):
     assert sorted(toy.executions(tmp_path)) == IDEAL
 
 
-def test_a_kill_in_the_middle_resumes_from_the_checkpoint(tmp_path):
+def test_a_kill_in_the_middle_resumes_from_the_checkpoint(tmp_path, caplog):
     (tmp_path / "gate").touch()
     process = start(tmp_path)
     log = tmp_path / "executions.log"
@@ -50,7 +50,11 @@ def test_a_kill_in_the_middle_resumes_from_the_checkpoint(tmp_path):
     assert len(list(store.folder(geom).parent.glob("*.tmp-*"))) == 1
     (tmp_path / "gate").unlink()
 
-    assert start(tmp_path).wait(60) == 0
+    with caplog.at_level("WARNING", "rtgs"):
+        InlineExecutor(store).execute(make_plan(toy.graph(tmp_path), store))
+    assert f"{geom.label} was cut before: its process was killed" in caplog.text
+    assert caplog.text.count("was cut before") == 1
+    assert "for want of memory" in caplog.text
     assert toy.executions(tmp_path)[:3] == ["prep", "geom from 0", "geom from 5"]
     assert len(toy.executions(tmp_path)) == 6
     assert make_plan(toy.graph(tmp_path), store).complete

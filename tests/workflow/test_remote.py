@@ -10,7 +10,9 @@ from pathlib import Path
 import pytest
 from toy import executions, graph
 
+from pipelines.cli.cache import main as cache_command
 from rtgs.workflow import InlineExecutor, RemoteStore, RemoteStoreError, Store, make_plan
+from rtgs.workflow.engine import WorkerJob
 from rtgs.workflow.manifest import NAME, Manifest, describe
 
 BUCKET = "artifacts"
@@ -248,3 +250,30 @@ def test_push_and_pull_of_one_run_move_only_its_steps(tmp_path, capsys):
     assert "0 artifacts sent" in capsys.readouterr().out
     assert main(["cache", "pull", *words, "--root", str(tmp_path / "one"), "--remote", shared]) == 0
     assert "are not there" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("secret", ["me:hunter2", "me:pa'ss word"])
+def test_the_password_of_an_address_is_in_nothing_that_is_said(tmp_path, capsys, caplog, monkeypatch, secret):
+    caplog.set_level(logging.INFO)
+    url = f"memory://{secret}@host/{tmp_path.name}"
+    remote = RemoteStore(url)
+    assert remote.url == url
+    run(tmp_path, "one", remote)
+    plan = make_plan(graph(tmp_path), Store(tmp_path / "two" / "store"), remote)
+    assert f"will be fetched from memory://***@host/{tmp_path.name}" in plan.steps[0].reason
+    run(tmp_path, "two", remote)
+    assert cache_command(["push", "--remote", url], tmp_path / "one") == 0
+    assert cache_command(["pull", "--remote", url], tmp_path / "three") == 0
+    said = [*caplog.messages, *(planned.reason for planned in plan), repr(WorkerJob("store", 1, url))]
+
+    def refuse(*arguments):
+        raise OSError(f"no route to {url}")
+
+    monkeypatch.setattr(type(remote._fs), "cat_file", refuse)
+    with pytest.raises(RemoteStoreError) as caught:
+        remote.manifest("toy", "0" * 64)
+    with pytest.raises(RemoteStoreError) as unknown:
+        RemoteStore(f"nosuch://{secret}@host")
+    said += [*capsys.readouterr(), str(caught.value), str(unknown.value)]
+    assert sum("***@host" in text for text in said) > 3
+    assert [text for text in said if secret.partition(":")[2] in text] == []

@@ -74,7 +74,7 @@ def slurm(tmp_path_factory) -> Iterator[Path]:
     """A controller and a node daemon for as long as the module runs; skips with the reason where there are none."""
     if missing := [program for program in PROGRAMS if found(program) is None]:
         pytest.skip(f"no {', '.join(missing)} here: apt install slurm-wlm")
-    pytest.importorskip("dask_jobqueue", reason="no dask-jobqueue here: pip install 'rtgs[cluster]'")
+    pytest.importorskip("dask_jobqueue", reason="no dask-jobqueue here: pip install -e '.[cluster]'")
     folder = tmp_path_factory.mktemp("slurm")
     for name in ("state", "spool"):
         (folder / name).mkdir()

@@ -14,13 +14,14 @@ from pathlib import Path
 import pytest
 import toy
 from test_engine import _count_threads, soon
+from test_wire import certificate_files
 from toy import ToyParams
 
 from rtgs.core.errors import RtgsError
 from rtgs.workflow import Step, Store, SweepOutcomes, make_plan
 from rtgs.workflow.engine import DaskExecutor, EngineSettings, WorkerJob, open_client
 
-asyncssh = pytest.importorskip("asyncssh", reason="no asyncssh here: pip install 'rtgs[cluster]'")
+asyncssh = pytest.importorskip("asyncssh", reason="no asyncssh here: pip install -e '.[cluster]'")
 pytestmark = pytest.mark.filterwarnings("ignore:coroutine 'Queue.join'")  # asyncssh's, at the end of a command
 HOSTS = ("one", "two", "three")  # names of ~/.ssh/config, all of them this machine
 
@@ -120,6 +121,25 @@ def test_workers_over_ssh_run_each_step_once_and_a_killed_one_is_replaced(hosts,
         "train 0.3",
     ]
     assert (store.folder(counting) / "threads.txt").read_text() == "2 2 quiet"
+
+
+def test_over_ssh_all_traffic_is_encrypted_and_pages_are_on_loopback(hosts, tmp_path):
+    files = certificate_files(tmp_path / "certificates")
+    with open_client(EngineSettings(kind="ssh", hosts=hosts, **files)) as client:
+        client.wait_for_workers(2, timeout=60)
+        workers = list(client.scheduler_info()["workers"])
+        pages = [client.run_on_scheduler(_pages_of_scheduler), *client.run(_pages_of_worker).values()]
+        address = client.scheduler.address  # pyright: ignore[reportOptionalMemberAccess]
+    assert all(each.startswith("tls://") for each in (address, *workers))
+    assert pages == ["127.0.0.1"] * 3
+
+
+def _pages_of_scheduler(dask_scheduler) -> str:
+    return dask_scheduler.http_server.address
+
+
+def _pages_of_worker(dask_worker) -> str:
+    return dask_worker.http_server.address
 
 
 def _owner(lock_file: str) -> int:

@@ -38,6 +38,7 @@ def test_manifest_tells_how_the_artifact_was_made(tmp_path):
     assert content["upstream"] == {"geom": target.upstream[0].fingerprint}
     assert content["files"]["result.txt"]["size"] == (artifact.folder / "result.txt").stat().st_size
     assert content["duration"] > 0.04
+    assert 0 <= content["cpu_seconds"] < 60
     assert content["machine"]["cores"] >= 1
     assert content["versions"]["rtgs"]
     assert str(tmp_path) not in json.dumps(content)
@@ -52,6 +53,7 @@ def test_a_changed_parameter_runs_only_what_depends_on_it(tmp_path):
 def test_a_folder_without_manifest_is_garbage(tmp_path):
     step = Step("prep", 1, ToyParams(1.0, str(tmp_path)), prep)
     store = Store(tmp_path / "store")
+    assert store.folder_of("prep", step.fingerprint) == store.folder(step)
     store.folder(step).mkdir(parents=True)
     (store.folder(step) / "data.txt").write_text("torn")
     assert store.find(step) is None

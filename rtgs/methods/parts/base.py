@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Protocol
 
@@ -15,12 +15,14 @@ from rtgs.gaussians.initialize import gaussians_from_points
 from rtgs.gaussians.normals import NORMAL_RESIDUAL
 from rtgs.gaussians.primitives import Gaussians
 from rtgs.gaussians.settings import DensitySettings, McmcSettings
+from rtgs.gaussians.smoothing import REFRESH_EVERY, Smoothing
 from rtgs.gaussians.surfels import ActivatedGaussians
 from rtgs.methods.parts.gaussian_set import GaussianSet, densified, opacity_reset
 from rtgs.methods.parts.kinds import GaussianKind, RasterRequest
 from rtgs.methods.parts.part import Frame, Part, Raster, Rows
 from rtgs.methods.shading.diffuse import diffuse
 from rtgs.render.features import named_features
+from rtgs.render.pose import seen_from
 from rtgs.train.method import Mode, Observation, RenderedView, RenderOptions, StepEvent
 from rtgs.train.schedule import (
     check_schedule,
@@ -52,6 +54,14 @@ class BaseRules(Protocol):
         ...
 
 
+class Painter(Protocol):
+    """What is composited of the base set, where another part decides it: shading of each Gaussian, for example."""
+
+    def paint(self, frame: Frame, rows: ActivatedGaussians) -> Tensor:
+        """(N, C) features of all Gaussians as they are activated for this view, the first three a colour."""
+        ...
+
+
 class BaseSet(Part):
     """A set of Gaussians of one kind from the scene's points (method.md 3.1), and its density control.
 
@@ -59,6 +69,8 @@ class BaseSet(Part):
         set: the Gaussians in training.
         schedule: of density control; a later stage may end it early.
         rules: of another part that decides about this set while it is in use; None: the schedule alone.
+        painter: of another part that says what is composited; None: SH colours and channels as they are.
+        bend: of another part that says which normals ellipsoids have, (N, 3) world of a view; None: shortest axes.
     """
 
     name = "base"
@@ -73,6 +85,8 @@ class BaseSet(Part):
         self.run_schedule = setup.schedule
         self.schedule = setup.schedule
         self.rules: BaseRules | None = None
+        self.painter: Painter | None = None
+        self.bend: Callable[[Frame, ActivatedGaussians], Tensor] | None = None
         self.mcmc = mcmc_of(settings.density)
         init = settings.init
         if self.mcmc is not None:
@@ -85,6 +99,11 @@ class BaseSet(Part):
             means_lr_steps=setup.schedule.means_lr_steps,
             extent=scene.extent,
         )
+        if settings.render.smoothing > 0:
+            cameras = [view.camera for view in scene.train]
+            near = settings.render.near * scene.extent
+            self.set.smoothing = Smoothing(settings.render.smoothing, cameras, near)
+            self.set.smoothing.refresh(self.set.gaussians.means)
         self._background = torch.tensor(settings.render.background)
         self._decisions = _decide_density(self.mcmc, setup.schedule)
 
@@ -114,10 +133,15 @@ class BaseSet(Part):
         """
         self.kind.refuse_lacking(wanted)
         watched = self.watched(frame)
-        rows = self.set.activated(frame.camera.center.float(), self.sh_degree(frame.step))
+        center = frame.camera.center if frame.pose is None else frame.pose.center
+        rows = self.set.activated(center.float(), self.sh_degree(frame.step))
         probe = self.set.new_probe() if watched else None
-        features = composited(self.set.gaussians, rows.colors)
+        features = (
+            composited(self.set.gaussians, rows.colors) if self.painter is None else self.painter.paint(frame, rows)
+        )
         shape, features = _joined(Rows(rows, features), appended)
+        if frame.pose is not None:
+            shape = seen_from(frame.pose, shape)
         more = len(shape.means) - len(self.set)  # rows that density control does not watch
         request = RasterRequest(
             frame.camera,
@@ -128,6 +152,7 @@ class BaseSet(Part):
             self.settings.render,
             self.extent,
             self._normal_residual(more) if wanted.normal else None,
+            self._bent(frame, rows, more) if wanted.normal else None,
         )
         buffers = self.kind.rasterize(shape, features, request)
         if probe is None or buffers.weight_sum is None:
@@ -158,6 +183,10 @@ class BaseSet(Part):
             return None
         return torch.nn.functional.pad(gaussians.activated(NORMAL_RESIDUAL), (0, 0, 0, more))
 
+    def _bent(self, frame: Frame, rows: ActivatedGaussians, more: int) -> Tensor | None:
+        """The normals that another part gives, 0 for ``more`` rows behind them."""
+        return None if self.bend is None else torch.nn.functional.pad(self.bend(frame, rows), (0, 0, 0, more))
+
     def shade(self, frame: Frame, raster: Raster) -> RenderedView:
         """The view as it is rasterised."""
         return RenderedView(frame.camera, diffuse(raster.buffers), raster.buffers, observations=raster.observations)
@@ -179,12 +208,20 @@ class BaseSet(Part):
         if densify_due(self.schedule, following) if rules is None else rules.densify_due(following):
             reset = opacity_was_reset(self.run_schedule, following)
             yield densified(self.set, self.settings.density, self.generator, following, after_reset=reset)
+            self._refresh_smoothing()
+        elif following % REFRESH_EVERY == 0:
+            self._refresh_smoothing()
         if not self.set.density.resets_opacity:
             return
         if opacity_reset_due(self.schedule, following) if rules is None else rules.reset_due(following):
             yield opacity_reset(self.set, self.settings.density)
             if rules is not None:
                 rules.after_reset()
+
+    def _refresh_smoothing(self) -> None:
+        """Means have moved, or are others."""
+        if self.set.smoothing is not None:
+            self.set.smoothing.refresh(self.set.gaussians.means)
 
 
 def mcmc_of(density: DensitySettings) -> McmcSettings | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 import torch
 from torch import Tensor
@@ -14,6 +14,7 @@ from rtgs.gaussians.density import DensityReport
 from rtgs.gaussians.mcmc import density_control
 from rtgs.gaussians.primitives import Gaussians
 from rtgs.gaussians.settings import DensitySettings, OptimizerSettings
+from rtgs.gaussians.smoothing import Smoothing
 from rtgs.gaussians.surfels import ActivatedGaussians
 from rtgs.train.method import Observation, StepEvent
 
@@ -22,6 +23,7 @@ class GaussianSet:
     """Gaussians of one kind + :class:`GaussianAdam` + density control, kept consistent through every change of N.
 
     ``name`` prefixes its tensors in a checkpoint and its lines in reports; ``extent`` is the scene's, world units.
+    ``smoothing`` is the filter that the Gaussians are shown with; its owner keeps it up to date.
     """
 
     def __init__(
@@ -35,22 +37,36 @@ class GaussianSet:
         extent: float,
     ) -> None:
         self.name = name
-        self.gaussians = gaussians.requires_grad_()
+        self.gaussians = _leaves(gaussians)
         self.extent = extent
         self._optimizer_settings = optimizer
         self._means_lr_steps = means_lr_steps
+        self._scheduled: Mapping[str, Callable[[int], float]] = {}
         self.optimizer = self._new_optimizer()
         self.density = density_control(density, extent)
+        self.smoothing: Smoothing | None = None
 
     def __len__(self) -> int:
         return len(self.gaussians)
 
     def _new_optimizer(self) -> GaussianAdam:
-        return GaussianAdam(self.gaussians, self._optimizer_settings, self.extent, means_lr_steps=self._means_lr_steps)
+        found = GaussianAdam(self.gaussians, self._optimizer_settings, self.extent, means_lr_steps=self._means_lr_steps)
+        found.scheduled = self._scheduled
+        return found
+
+    def schedule_rates(self, rates: Mapping[str, Callable[[int], float]]) -> None:
+        """From now on these parameters, as far as they are there, learn at the rate that is given for each step."""
+        self._scheduled = rates
+        self.optimizer.scheduled = rates
 
     def activated(self, camera_center: Tensor, sh_degree: int) -> ActivatedGaussians:
         """Activated Gaussians as seen from ``camera_center`` (3,) world, SH up to ``sh_degree``."""
-        return activate_gaussians(self.gaussians, camera_center, sh_degree)
+        shape = activate_gaussians(self.gaussians, camera_center, sh_degree)
+        return shape if self.smoothing is None else self.smoothing.apply(shape)
+
+    def shown(self) -> Gaussians:
+        """The Gaussians with the filter they are shown with in their own scales and opacities; no copy without one."""
+        return self.gaussians if self.smoothing is None else self.smoothing.fused(self.gaussians)
 
     def tensors(self) -> Iterable[tuple[str, Tensor]]:
         """(name, tensor) of every raw parameter."""
@@ -61,7 +77,7 @@ class GaussianSet:
         if len(gaussians) != len(self):
             raise ValueError(f"set {self.name!r} has {len(self)} rows, {len(gaussians)} were given; use apply_plan")
         before = self.optimizer
-        self.gaussians = gaussians.requires_grad_()
+        self.gaussians = _leaves(gaussians)
         self.optimizer = self._new_optimizer()
         self.optimizer.inherit(before)
 
@@ -114,6 +130,8 @@ class GaussianSet:
             "adam": self.optimizer.state(),
             "density": self.density.state(),
         }
+        if self.smoothing is not None:
+            parts["smoothing"] = {"intervals": self.smoothing.intervals}
         return {
             f"{self.name}.{part}.{name}": tensor for part, tensors in parts.items() for name, tensor in tensors.items()
         }
@@ -137,10 +155,12 @@ class GaussianSet:
                     f"the checkpoint has no {self.name}.surfels.{name}: it was written by another method or version; "
                     "train again from the start"
                 )
-            self.gaussians[name] = parameters[name].clone().requires_grad_()
+            self.gaussians[name] = parameters[name].clone().contiguous().requires_grad_()
         self.optimizer = self._new_optimizer()  # moments of the loaded number of rows
         self.optimizer.load(part("adam"))
         self.density.load(part("density"))
+        if self.smoothing is not None:
+            self.smoothing.intervals = part("smoothing").get("intervals", self.smoothing.intervals[:0]).clone()
 
     def _refuse_more(self, parameters: Mapping[str, Tensor]) -> None:
         if more := sorted(name for name in parameters if name not in self.gaussians):
@@ -150,6 +170,14 @@ class GaussianSet:
                 f"{held}): the `restore` of the part that owns the set must first bring it to the channels of the "
                 "state, with `GaussianSet.adopt` or as a new set"
             )
+
+
+def _leaves(gaussians: Gaussians) -> Gaussians:
+    """Ready to train: contiguous, since Adam moves them in place and a checkpoint holds no other layout."""
+    for name, tensor in gaussians.items():
+        if not tensor.is_contiguous():
+            gaussians[name] = tensor.detach().contiguous()
+    return gaussians.requires_grad_()
 
 
 def densified(

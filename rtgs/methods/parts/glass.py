@@ -29,13 +29,13 @@ from rtgs.methods.parts.rough_walls import GlassView, Scatter, bent_rays
 from rtgs.methods.parts.straight_rays import FarWall, StraightRays
 from rtgs.methods.parts.traced_set import FollowingTree, TracedSet
 from rtgs.methods.parts.vertices import LearnedVertices, hidden_pixels, why_not
-from rtgs.methods.parts.wall_light import InnerRays, WallLight, walls_of
+from rtgs.methods.parts.wall_light import WallLight, walls_of
 from rtgs.methods.plans import transmittance_plan
 from rtgs.methods.shading.bent import Bend, bent_paths
 from rtgs.methods.shading.lights import Light, Traced, lit_view, mean_of_lights
 from rtgs.methods.shading.mirror import SurfacePixels, reflected_weight
 from rtgs.methods.shading.outline import Outline, with_beside
-from rtgs.methods.shading.straight import GlassPixels, GlassRays, Transmission, glass_rays, glass_weights
+from rtgs.methods.shading.straight import GlassPixels, Transmission, glass_rays, glass_weights
 from rtgs.train.method import Mode, Observation, RenderedView, RenderOptions, Stage, StepEvent
 from rtgs.train.parameters import ParameterGroup
 from rtgs.train.schedule import (
@@ -239,7 +239,8 @@ class Glass(Part):
     def _sample(self, shown: GlassView, scatter: Scatter | None) -> tuple[Reflected, Transmission, tuple[Light, ...]]:
         """What one ray of each kind meets behind each traced pixel, and the lights of it; ``scatter``: rough walls."""
         frame, chosen, rays = shown.frame, shown.chosen, shown.rays
-        inner = None if self.wall is None else self.wall.inner_rays(frame.camera, rays, chosen.index[rays.rows])
+        pixels = chosen.index[rays.rows]
+        inner = None if self.wall is None else self.wall.inner_rays(frame.camera, rays, pixels)
         if inner is not None and shown.bend is not None:
             inner = replace(inner, paths=bent_paths(inner.paths, shown.bend))
         leaving = None if inner is None else inner.leaving(scatter)
@@ -248,7 +249,8 @@ class Glass(Part):
         inside = shown.glass.inside[chosen.index]
         reflection, transmission = self.weights(met, inside, frame.camera, chosen.index, shown.outline)
         near, onward = (rays, None) if bent is None else (bent.near, bent.far)
-        passed = self.transmit(frame, near, chosen.index[rays.rows], inner, met.others, onward)
+        wall = None if self.wall is None else FarWall(inner, met.others, self.wall.index, self.wall.tint)
+        passed = self._straight(frame).transmit(frame, near, pixels, wall, onward)
         through = Light("transmission", "transmitted_color", transmission, passed.color, passed.parts)
         own, *coats = self.mirror.lights(met, reflection, inside)
         return met, passed, (own, through, *coats)
@@ -290,20 +292,6 @@ class Glass(Part):
         largest = settings.max_weight if bounded else 0.0
         return glass_weights(reflection, cosine, met.pixels, inside, optics, largest, settings.weight_bound)
 
-    def transmit(
-        self,
-        frame: Frame,
-        rays: GlassRays,
-        pixels: Tensor,
-        inner: InnerRays | None = None,
-        surroundings: Tensor | None = None,
-        onward: GlassRays | None = None,
-    ) -> Transmission:
-        """C_t of the traced pixels; ``surroundings``: what the rays met that leave the object after ``inner`` paths;
-        ``onward``: the rays behind the far wall, if it bends them."""
-        wall = None if self.wall is None else FarWall(inner, surroundings, self.wall.index, self.wall.tint)
-        return self._straight(frame).transmit(frame, rays, pixels, wall, onward)
-
     def _straight(self, frame: Frame) -> StraightRays:
         assert self.guide is not None
         own = self.transmittance
@@ -315,7 +303,7 @@ class Glass(Part):
             own,
             0 if own is None else self._own_degree(frame.step),
             frame.training and self._depth_loss_on(frame.step),
-            frame.training and own is not None and self._watching(own, frame.step),
+            frame.training and own is not None and own.density.needs_signal and self._densifying(frame.step),
         )
 
     def _own_degree(self, step: int) -> int:
@@ -326,8 +314,8 @@ class Glass(Part):
             return min(self.base.sh_degree(step), largest)
         return sh_degree_at(self.plan.own, self.plan.clock(step), largest)
 
-    def _watching(self, own: TracedSet, step: int) -> bool:
-        return own.density.needs_signal and densify_ahead(self.plan.own, self.plan.clock(step))
+    def _densifying(self, step: int) -> bool:
+        return densify_ahead(self.plan.own, self.plan.clock(step))
 
     def _depth_loss_on(self, step: int) -> bool:
         loss = self.settings.loss

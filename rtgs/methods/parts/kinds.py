@@ -34,6 +34,7 @@ class RasterRequest:
     settings: RenderSettings
     extent: float  # of the scene, world units: near and far are shares of it
     normal_residual: Tensor | None = None  # (N, 3) of the normals of ellipsoids, where the set has one
+    normals: Tensor | None = None  # (N, 3) world, of ellipsoids: composited instead of those of the shortest axes
 
 
 Rasterize = Callable[[ActivatedGaussians, Tensor, RasterRequest], RasterBuffers]
@@ -68,6 +69,8 @@ def surfel_options(
         normal=wanted.normal,
         distortion=wanted.distortion,
         weight_sum=weight_sum,
+        low_pass=settings.low_pass,
+        convolved=settings.surfel_filter == "convolved",
     )
 
 
@@ -99,6 +102,8 @@ def _ellipsoids(rows: ActivatedGaussians, features: Tensor, request: RasterReque
 
 def _facing_normals(rows: ActivatedGaussians, request: RasterRequest) -> Tensor:
     """(N, 3) of activated ellipsoids, as :func:`rtgs.gaussians.normals.ellipsoid_normals` gives them of raw ones."""
+    if request.normals is not None:
+        return request.normals
     third = torch.linalg.cross(rows.tangent_u, rows.tangent_v, dim=1)
     axes = torch.stack((rows.tangent_u, rows.tangent_v, third), dim=1)
     return shortest_axes(axes, rows.scales, rows.means, request.camera.center, request.normal_residual)

@@ -18,12 +18,14 @@ from rtgs.gaussians.channels import Channel
 from rtgs.gaussians.materials import has_materials, with_materials, without_materials
 from rtgs.gaussians.primitives import PARAMETERS
 from rtgs.gaussians.surfels import Surfels
+from rtgs.light.cubemap import CubemapLight
 from rtgs.methods.parts.base import BaseSet
+from rtgs.methods.parts.environment import Environment
 from rtgs.methods.parts.gaussian_set import GaussianSet, densified, opacity_reset
 from rtgs.methods.parts.matte import MatteEvidence, gather_evidence
 from rtgs.methods.parts.part import Frame, Part, Raster
 from rtgs.methods.parts.propagation import propagate_normals, reset_specular
-from rtgs.methods.parts.reflection_init import reflection_surfels, scene_color
+from rtgs.methods.parts.reflection_init import copied_surfels, reflection_surfels, scene_color
 from rtgs.methods.parts.traced_set import TracedSet
 from rtgs.methods.plans import (
     base_densify_due,
@@ -49,6 +51,7 @@ from rtgs.methods.shading.traced_pixels import TracedPixels, choose_pixels
 from rtgs.render.buffers import RasterBuffers, TraceOptions
 from rtgs.train.losses import surface_depth
 from rtgs.train.method import Mode, Observation, RenderedView, RenderOptions, Stage, StepEvent
+from rtgs.train.parameters import ParameterGroup
 from rtgs.train.schedule import densify_ahead, densify_due, opacity_was_reset, sh_degree_at
 from rtgs.train.settings import ScheduleSettings
 
@@ -99,11 +102,21 @@ class Mirror(Part):
         self._matte: MatteEvidence | None = None
         self._points = setup.scene.points
         self._views = setup.scene.train
-        self._sky = scene_color(setup.settings.reflection.background, (view.image for view in setup.scene.train))
+        background = setup.settings.reflection.background
+        self._sky = scene_color(background, (view.image for view in setup.scene.train))
+        self.far = Environment(setup, self.plan.start) if background == "cubemap" else None
 
     @property
     def sets(self) -> tuple[GaussianSet, ...]:
         return () if self.set is None else (self.set,)
+
+    @property
+    def groups(self) -> tuple[ParameterGroup, ...]:
+        return () if self.far is None else self.far.groups
+
+    @property
+    def light(self) -> CubemapLight | None:
+        return None if self.far is None else self.far.light
 
     @property
     def decisions(self) -> tuple[Decision, ...]:
@@ -131,6 +144,13 @@ class Mirror(Part):
             return
         self.base.set.adopt(with_materials(self.base.set.gaussians, self.settings.materials))
         settings = self.settings.reflection
+        if self.far is not None:
+            self.far.begin()
+        if settings.init_from == "base":
+            copied = copied_surfels(self.base.set.gaussians, settings.density.max_surfels, settings.init.sh_degree)
+            self._adopt(copied)
+            yield StepEvent("begin", "reflection", f"{len(copied)} surfels of the base set")
+            return
         color = scene_color(settings.init_color, (view.image for view in self._views))
         self._adopt(reflection_surfels(settings, self._points, self.extent, self.generator, color))
         assert self.set is not None
@@ -227,10 +247,16 @@ class Mirror(Part):
             origins, directions = torch.cat((origins, more[0])), torch.cat((directions, more[1]))
         traced, observations = self.set.trace(origins, directions, options, watched=watched)
         assert traced.colors is not None
-        colors = traced.colors if self._sky is None else traced.colors + (1 - traced.alpha)[:, None] * self._sky
+        colors = self.over_sky(traced.colors, traced.alpha, directions)
         colors, others = (colors, None) if more is None else (colors[:own], colors[own:])
         color = (colors if chosen.shared is None else colors.index_select(0, chosen.shared.ray)).T
         return Reflected(pixels, rays, color, observations, others)
+
+    def over_sky(self, colors: Tensor, alpha: Tensor, directions: Tensor) -> Tensor:
+        """(R, 3) colours of rays along ``directions`` (R, 3) with what is seen where they meet nothing; ``alpha`` (R,)
+        of what they met."""
+        sky = self._sky if (light := self.light) is None else light(directions)
+        return colors if sky is None else colors + (1 - alpha)[:, None] * sky
 
     def lights(self, met: Reflected, weight: Tensor, bare: Tensor | None = None) -> tuple[Light, ...]:
         """What the surface mirrors, with its ``weight``, and what it shows under a coat.
@@ -295,6 +321,8 @@ class Mirror(Part):
             yield StepEvent("decision", "reflection", f"goes on: {evidence}")
             return
         self.set = None
+        if self.far is not None:
+            self.far.end()
         self.base.set.adopt(without_materials(self.base.set.gaussians))
         self._matte = evidence
         decision = self.decisions[-1]
@@ -340,6 +368,8 @@ class Mirror(Part):
             plain = without_materials(gaussians)
             self.base.set.adopt(with_materials(plain, self.settings.materials) if specular else plain)
         self._adopt(stored_surfels(state, "reflection"))
+        if self.far is not None:
+            self.far.restore(state)
         if "matte" in state:
             self._matte = MatteEvidence.of(state["matte"])
 

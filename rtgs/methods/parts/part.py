@@ -11,11 +11,14 @@ from torch import Tensor
 
 from rtgs.core.cameras import Camera
 from rtgs.core.decisions import Decision
+from rtgs.core.errors import RtgsError
 from rtgs.gaussians.surfels import ActivatedGaussians
 from rtgs.render.buffers import RasterBuffers
+from rtgs.render.pose import Pose
 from rtgs.train.method import Mode, Observation, RenderedView, RenderOptions, Stage, StepEvent
 
 if TYPE_CHECKING:
+    from rtgs.light.cubemap import DirectionalLight
     from rtgs.methods.parts.gaussian_set import GaussianSet
     from rtgs.train.parameters import ParameterGroup
 
@@ -29,6 +32,7 @@ class Frame:
     mode: Mode
     options: RenderOptions
     mask: Tensor | None = None  # (H, W) bool, the view's own of its transparent objects
+    pose: Pose | None = None  # of ``camera``, with its graph, where this view teaches it
 
     @property
     def training(self) -> bool:
@@ -37,7 +41,16 @@ class Frame:
 
     @cached_property
     def rays(self) -> ViewRays:
-        """The rays of all pixels."""
+        """The rays of all pixels.
+
+        Raises:
+            RtgsError: the view teaches the pose of its camera, which rays do not.
+        """
+        if self.pose is not None:
+            raise RtgsError(
+                f"the pose of view {self.camera.name!r} is learned (method.poses.enabled), but this method traces rays "
+                "from its pixels, and they give no gradient of it: set it to false"
+            )
         found = self.camera.rays()
         return ViewRays(found.origin, found.directions.reshape(-1, 3).T)
 
@@ -85,6 +98,11 @@ class Part:
     def decisions(self) -> tuple[Decision, ...]:
         """What this part does without or differently, as far as it is known by now."""
         return ()
+
+    @property
+    def light(self) -> DirectionalLight | None:
+        """The far light of this part, as it is at present; None: it has none."""
+        return None
 
     def begin(self, stage: Stage) -> Iterable[StepEvent]:
         """A stage starts afresh."""

@@ -1,4 +1,4 @@
-"""Where the reflection set comes from: stratified random surfels in a box (method.md 6.1)."""
+"""Where the reflection set comes from: stratified random surfels in a box (method.md 6.1), or the base set."""
 
 from __future__ import annotations
 
@@ -6,8 +6,12 @@ from collections.abc import Iterable
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
+from rtgs.gaussians.density import select_rows
+from rtgs.gaussians.harmonics import rest_count
 from rtgs.gaussians.initialize import points_box
+from rtgs.gaussians.primitives import Gaussians
 from rtgs.gaussians.surfels import Surfels
 from rtgs.methods.parts.stratified import stratified_surfels
 from rtgs.methods.settings import ReflectionSettings
@@ -39,6 +43,26 @@ def reflection_surfels(
     """
     box = reflection_box(settings, points, extent)
     return stratified_surfels(box, settings.cells, settings.per_cell, settings.init, generator, color)
+
+
+def copied_surfels(base: Gaussians, most: int, sh_degree: int) -> Surfels:
+    """The surfels of ``base`` without its channels, at most the ``most`` opaque ones of them, in their order; SH above
+    ``sh_degree`` are left out, and those that it lacks are 0.
+
+    Raises:
+        TypeError: the base set is not of surfels.
+    """
+    if not isinstance(base, Surfels):
+        raise TypeError(
+            f"method.reflection.init_from=base copies surfels, and the base set is of {type(base).__name__}"
+        )
+    chosen = torch.arange(len(base))
+    if len(base) > most:
+        chosen = base.opacity_logits.detach().topk(most).indices.sort().values
+    copied = select_rows(base.without_channels(*(channel.name for channel in base.channels)), chosen)
+    rest = copied.sh_rest[:, : rest_count(sh_degree)]
+    copied.sh_rest = pad(rest, (0, 0, 0, rest_count(sh_degree) - rest.shape[1])).contiguous()
+    return copied
 
 
 def scene_color(kind: str, images: Iterable[Tensor]) -> Tensor | None:

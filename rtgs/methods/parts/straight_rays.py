@@ -153,7 +153,8 @@ class StraightRays:
     ) -> tuple[TraceBuffers, tuple[Observation, ...]]:
         """Through the transmittance set, or through the base set inside the object."""
         settings = self.settings.transmittance
-        if self.own is not None and settings.contents == "rasterized" and not self.settings.single_rays:
+        rasterized = settings.contents == "rasterized" and not self.settings.single_rays
+        if self.own is not None and rasterized and len(pixels) > 0:
             return self._rasterized(frame, rays, pixels)
         thickness = rays.far - rays.near
         origins, directions = rays.at(rays.near)

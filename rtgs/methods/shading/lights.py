@@ -82,6 +82,9 @@ def lit_view(frame: Frame, raster: Raster, traced: Traced, blend: str) -> Render
             shown = encoded(pixels.specular * light.weight * decoded(light.color, blend), blend)
             layers[light.name] = full_map(shown.detach(), chosen, shape)
             layers[light.color_name] = full_map(light.color.detach(), chosen, shape)
+            if frame.options.weights:
+                weight = (pixels.specular * light.weight).detach().expand(3, -1)
+                layers[f"{light.name}_weight"] = full_map(weight, chosen, shape).mean(0)
             for name, part in light.parts.items():
                 shown = encoded(pixels.specular * light.weight * part, "linear")
                 layers[name] = full_map(shown.detach(), chosen, shape)

@@ -5,6 +5,7 @@
 
 #include "bind/bindings.h"
 #include "common/isa.h"
+#include "common/threads.h"
 #include "gaussians/activation.h"
 
 namespace rtgs {
@@ -24,7 +25,7 @@ ActivationShape checked_shape(const nb::tuple& center, int degree, const Floats 
   if (degree < 0 || degree > 3 || (degree + 1) * (degree + 1) - 1 > rest)
     throw std::invalid_argument("activate_gaussians: SH degree " + std::to_string(degree) + " does not fit the " +
                                 std::to_string(rest) + " stored coefficients (degree 0 .. 3)");
-  ActivationShape shape{long(count), degree, rest, int(raw[1].shape(1)), {}, threads < 1 ? 1 : threads};
+  ActivationShape shape{long(count), degree, rest, int(raw[1].shape(1)), {}, checked_threads(threads)};
   for (int k = 0; k < 3; ++k) shape.center[k] = nb::cast<float>(center[k]);
   return shape;
 }

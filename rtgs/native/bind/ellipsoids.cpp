@@ -20,7 +20,7 @@ class EllipsoidRasterization : public RasterSession {
     nb::gil_scoped_release release;
     const GaussianArrays in = gaussian_arrays(means, tangent_u, tangent_v, scales, opacities, features);
     start(in, make_layout(in.channels), threads);
-    RTGS_CALL(isa_, project_ellipsoids, camera_, settings_, in, gaussians_, threads);
+    RTGS_CALL(isa_, project_ellipsoids, camera_, settings_, in, gaussians_, threads_);
     bin();
   }
 

@@ -4,11 +4,13 @@
 
 #include <algorithm>
 #include <optional>
+#include <stdexcept>
 #include <vector>
 
 #include "bind/bindings.h"
 #include "image/image.h"
 #include "common/isa.h"
+#include "common/threads.h"
 
 namespace rtgs {
 namespace {
@@ -48,13 +50,13 @@ std::pair<double, double> photometric_loss(Floats image, Floats target, float l1
   a.l1_scale = float(l1 / count), a.dssim_scale = float(dssim / count);
   a.gradient = pointer(gradient);
   a.dissimilarity = pointer(dissimilarity);
-  a.threads = threads;
+  a.threads = checked_threads(threads);
   nb::gil_scoped_release release;
   std::vector<double> l1_rows(size_t(a.channels) * a.height), dssim_rows(with_dssim ? l1_rows.size() : 0);
   a.l1_rows = l1_rows.data();
   if (with_dssim) {
     a.dssim_rows = dssim_rows.data();
-    a.scratch = scratch(photometric_scratch(a.width) * threads);
+    a.scratch = scratch(photometric_scratch(a.width) * a.threads);
   }
   RTGS_DISPATCH(photometric, a);
   return {total(l1_rows) / count, total(dssim_rows) / count};
@@ -76,11 +78,11 @@ double normal_consistency_loss(Floats normal, Floats depth, Floats alpha, bool d
   a.gradient_normal = pointer(gradient_normal);
   a.gradient_depth = pointer(gradient_depth);
   a.gradient_alpha = pointer(gradient_alpha);
-  a.threads = threads;
+  a.threads = checked_threads(threads);
   nb::gil_scoped_release release;
   std::vector<double> rows(a.view.height);
   a.rows = rows.data();
-  a.scratch = scratch(normal_scratch(a.view.width) * threads);
+  a.scratch = scratch(normal_scratch(a.view.width) * a.threads);
   RTGS_DISPATCH(normal_consistency, a);
   return total(rows) / count;
 }
@@ -96,7 +98,7 @@ double mono_normal_loss(Floats normal, Floats mono, std::optional<Floats> weight
   double count = double(a.view.height) * a.view.width;
   a.scale = float(1 / count);
   a.gradient_normal = pointer(gradient_normal);
-  a.threads = threads;
+  a.threads = checked_threads(threads);
   nb::gil_scoped_release release;
   std::vector<double> rows(a.view.height);
   a.rows = rows.data();
@@ -106,6 +108,7 @@ double mono_normal_loss(Floats normal, Floats mono, std::optional<Floats> weight
 
 // Nearest-rank 1st and 99th percentile of the positive surface depths on every `step`-th pixel of every `step`-th row.
 std::pair<float, float> depth_percentiles(Floats depth, std::optional<Floats> alpha, float least_alpha, int step) {
+  if (step < 1) throw std::invalid_argument("depth_percentiles: step=" + std::to_string(step) + " must be at least 1");
   nb::gil_scoped_release release;
   long height = long(depth.shape(0)), width = long(depth.shape(1));
   std::vector<float> values;

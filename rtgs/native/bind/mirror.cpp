@@ -6,6 +6,7 @@
 
 #include "bind/bindings.h"
 #include "common/isa.h"
+#include "common/threads.h"
 #include "image/mirror.h"
 
 namespace rtgs {
@@ -26,7 +27,7 @@ MirrorPixels mirror_pixels(const Floats& normal, const Floats& depth, const Floa
   require(view, "view", 3 * count);
   const auto [x, y, z] = center;
   return {int64_t(count), normal.data(), depth.data(), view.data(), {x, y, z}, shortest_normal, raw,
-          threads < 1 ? 1 : threads};
+          checked_threads(threads)};
 }
 
 MirrorRays rays_of(const Floats& origins, const Floats& directions, const Floats& cosine, size_t count) {
@@ -41,7 +42,7 @@ MicrofacetPixels microfacet_pixels(const Floats& cosine, const Floats& roughness
   require(roughness, "roughness", cosine.size());
   require(f0, "f0", cosine.size());
   return {int64_t(cosine.size()), cosine.data(), roughness.data(), f0.data(), cosine_floor, roughness_floor, bound,
-          threads < 1 ? 1 : threads};
+          checked_threads(threads)};
 }
 
 }  // namespace

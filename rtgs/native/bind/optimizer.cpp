@@ -7,6 +7,7 @@
 
 #include "bind/bindings.h"
 #include "common/isa.h"
+#include "common/threads.h"
 #include "optimizer/adam.h"
 
 namespace rtgs {
@@ -35,7 +36,7 @@ long adam_step(const std::vector<AdamEntry>& entries, double beta1, double beta2
     if (t.rows > 0 && t.active > 0) tensors.push_back(t);
   }
   const AdamSettings settings = {float(1 - beta1),   float(beta2), float(1 - beta2),
-                                 float(second_scale), float(eps),   threads < 1 ? 1 : threads};
+                                 float(second_scale), float(eps),   checked_threads(threads)};
   nb::gil_scoped_release release;
   return RTGS_DISPATCH(adam_step, tensors.data(), int(tensors.size()), settings);
 }
@@ -44,7 +45,7 @@ long count_nonfinite(const Floats& values, int threads) {
   const float* data = values.data();
   const long size = long(values.size());
   nb::gil_scoped_release release;
-  return RTGS_DISPATCH(count_nonfinite, data, size, threads < 1 ? 1 : threads);
+  return RTGS_DISPATCH(count_nonfinite, data, size, checked_threads(threads));
 }
 
 }  // namespace

@@ -17,7 +17,7 @@ class Rasterization : public RasterSession {
     nb::gil_scoped_release release;
     const GaussianArrays in = gaussian_arrays(means, tangent_u, tangent_v, scales, opacities, features);
     start(in, make_layout(in.channels), threads);
-    RTGS_CALL(isa_, project_surfels, camera_, in, gaussians_, threads);
+    RTGS_CALL(isa_, project_surfels, camera_, in, gaussians_, threads_);
     bin();
   }
 
@@ -89,10 +89,11 @@ class Rasterization : public RasterSession {
 
 void bind_raster(nb::module_& m) {
   nb::class_<CameraValues>(m, "RasterCamera", "Pose (world to camera), intrinsics in pixels, and the cut rules.")
-      .def(nb::init<Doubles, Doubles, double, double, double, double, int, int, double, double, double, double>(),
+      .def(nb::init<Doubles, Doubles, double, double, double, double, int, int, double, double, double, double,
+                    double>(),
            nb::arg("rotation"), nb::arg("translation"), nb::arg("fx"), nb::arg("fy"), nb::arg("cx"), nb::arg("cy"),
            nb::arg("width"), nb::arg("height"), nb::arg("near"), nb::arg("far"), nb::arg("min_alpha") = 1.0 / 255,
-           nb::arg("min_transmittance") = 1e-4);
+           nb::arg("min_transmittance") = 1e-4, nb::arg("low_pass") = 0.5);
   nb::class_<Rasterization>(m, "Rasterization", "One surfel rasterisation; see rtgs/render/surfels.py.")
       .def(nb::init<const CameraValues&, bool, bool>(), nb::arg("camera"), nb::arg("normal"), nb::arg("depth"))
       .def("project", &Rasterization::project)

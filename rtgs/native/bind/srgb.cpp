@@ -2,6 +2,7 @@
 
 #include "bind/bindings.h"
 #include "common/isa.h"
+#include "common/threads.h"
 #include "image/srgb.h"
 
 namespace rtgs {
@@ -9,7 +10,7 @@ namespace {
 
 SrgbNumbers numbers(const Floats& from, const Floats& to, int threads) {
   if (from.size() != to.size()) throw std::invalid_argument("srgb: as many numbers must come out as go in");
-  return {int64_t(from.size()), from.data(), to.data(), threads < 1 ? 1 : threads};
+  return {int64_t(from.size()), from.data(), to.data(), checked_threads(threads)};
 }
 
 }  // namespace

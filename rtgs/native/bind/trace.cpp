@@ -10,6 +10,7 @@
 #include "bind/bindings.h"
 #include "trace/bvh_tree.h"
 #include "common/isa.h"
+#include "common/threads.h"
 #include "trace/state.h"
 
 namespace rtgs {
@@ -38,7 +39,7 @@ class Tracing {
  public:
   Tracing(float transmittance_cutoff, float alpha_cutoff, int sh_degree, bool last_sh, bool raw_sh,
           const std::string& order, int threads)
-      : isa_(active_isa()), options_{transmittance_cutoff, alpha_cutoff, last_sh, raw_sh, threads < 1 ? 1 : threads},
+      : isa_(active_isa()), options_{transmittance_cutoff, alpha_cutoff, last_sh, raw_sh, checked_threads(threads)},
         sh_degree_(sh_degree), order_(order), memory_(TraceMemoryPool::instance().take()) {
     if (order != "given" && order != "sorted" && order != "auto")
       throw std::invalid_argument("trace: order '" + order + "' is not one of given, sorted, auto");
@@ -52,6 +53,7 @@ class Tracing {
                MaybeFloats out_colors, MaybeFloats out_features, Floats out_alpha, MaybeFloats out_depth,
                MaybeFloats out_normal, MaybeFloats out_weight_sum) {
     nb::gil_scoped_release release;
+    kept_ = false;
     TraceMemory& m = *memory_;
     surfels_ = trace_surfels(means, tangent_u, tangent_v, scales, opacities, features, sh_dc, sh_rest);
     const int64_t count = surfels_.arrays.count;
@@ -209,13 +211,13 @@ void bind_trace(nb::module_& m) {
       .def("build", [](SurfelTree& tree, Floats means, Floats tangent_u, Floats tangent_v, Floats scales, Floats opacities,
                        float alpha_cutoff, int threads) {
         nb::gil_scoped_release release;
-        tree.build(geometry_arrays(means, tangent_u, tangent_v, scales, opacities), alpha_cutoff, threads);
+        tree.build(geometry_arrays(means, tangent_u, tangent_v, scales, opacities), alpha_cutoff, checked_threads(threads));
       }, nb::arg("means"), nb::arg("tangent_u"), nb::arg("tangent_v"), nb::arg("scales"), nb::arg("opacities"),
          nb::arg("alpha_cutoff"), nb::arg("threads"))
       .def("refit", [](SurfelTree& tree, Floats means, Floats tangent_u, Floats tangent_v, Floats scales, Floats opacities,
                        float alpha_cutoff, int threads) {
         nb::gil_scoped_release release;
-        tree.refit(geometry_arrays(means, tangent_u, tangent_v, scales, opacities), alpha_cutoff, threads);
+        tree.refit(geometry_arrays(means, tangent_u, tangent_v, scales, opacities), alpha_cutoff, checked_threads(threads));
       }, nb::arg("means"), nb::arg("tangent_u"), nb::arg("tangent_v"), nb::arg("scales"), nb::arg("opacities"),
          nb::arg("alpha_cutoff"), nb::arg("threads"))
       .def_prop_ro("nodes", &SurfelTree::nodes)

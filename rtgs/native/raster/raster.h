@@ -16,6 +16,7 @@ struct RasterCamera {  // a view and its cut rules
   float near, far;
   float min_alpha, log2_min_alpha;  // a contribution below it is skipped
   float min_transmittance;          // a pixel stops after the contribution that takes it below
+  float low_pass;                   // surfels: 1 / variance (px^2) of the disc below which no footprint shrinks
   int tiles_x() const { return (width + kTileSide - 1) / kTileSide; }
   int tiles_y() const { return (height + kTileSide - 1) / kTileSide; }
   int64_t pixels() const { return int64_t(width) * height; }

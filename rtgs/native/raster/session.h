@@ -4,9 +4,11 @@
 
 #include <cmath>
 #include <optional>
+#include <stdexcept>
 
 #include "bind/bindings.h"
 #include "common/isa.h"
+#include "common/threads.h"
 #include "raster/state.h"
 
 namespace rtgs {
@@ -28,7 +30,7 @@ inline int whole_lines(int floats) { return (floats + 15) / 16 * 16; }
 struct CameraValues {
   RasterCamera values;
   CameraValues(Doubles rotation, Doubles translation, double fx, double fy, double cx, double cy, int width, int height,
-               double near, double far, double min_alpha, double min_transmittance) {
+               double near, double far, double min_alpha, double min_transmittance, double low_pass) {
     for (int k = 0; k < 9; ++k) values.rotation[k] = float(rotation.data()[k]);
     for (int k = 0; k < 3; ++k) values.translation[k] = float(translation.data()[k]);
     values.fx = float(fx), values.fy = float(fy), values.cx = float(cx), values.cy = float(cy);
@@ -36,6 +38,7 @@ struct CameraValues {
     values.near = float(near), values.far = float(far);
     values.min_alpha = float(min_alpha), values.log2_min_alpha = float(std::log2(min_alpha));
     values.min_transmittance = float(min_transmittance);
+    values.low_pass = float(1 / low_pass);
   }
 };
 
@@ -58,8 +61,9 @@ class RasterSession {
 
   // Before the projection: memory for its results.
   void start(const GaussianArrays& in, const RecordLayout& layout, int threads) {
+    projected_ = false;
+    threads_ = checked_threads(threads);
     count_ = in.count;
-    threads_ = threads;
     features_ = in.channels;
     gaussians_.layout = layout;
     gaussians_.records = memory_->records.reserve((count_ + 16) * layout.record_stride + 64);
@@ -82,10 +86,12 @@ class RasterSession {
     tiles_.ids = m.ids.reserve(entries_ + 1);
     tiles_.masks = m.masks.reserve(entries_ + 1);
     RTGS_CALL(isa_, fill_tiles, camera_, gaussians_, keys, visible_, scratch, tiles_.ids, threads_);
+    projected_ = true;
   }
 
   // What both passes need; `planes` images of scratch, the first for the transmittance.
   ForwardArgs forward_args(const Floats& feature_image, const MaybeFloats& extra_image, int planes) {
+    if (!projected_) throw std::logic_error("rasterise: project() comes first, and must have succeeded");
     ForwardArgs args{};
     args.camera = camera_;
     args.gaussians = gaussians_;
@@ -123,6 +129,7 @@ class RasterSession {
   RasterCamera camera_;
   int64_t count_ = 0, visible_ = 0, entries_ = 0;
   int features_ = 0, threads_ = 1;
+  bool projected_ = false;
   ProjectedGaussians gaussians_{};
   TileLists tiles_{};
   std::unique_ptr<RasterMemory> memory_;

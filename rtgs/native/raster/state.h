@@ -3,13 +3,13 @@
 #include <cstdlib>
 #include <memory>
 #include <mutex>
-#include <new>
 #include <vector>
 #if defined(__linux__)
 #include <sys/mman.h>
 #endif
 
 #include "common/isa.h"
+#include "common/memory.h"
 #include "raster/raster.h"
 
 namespace rtgs {
@@ -27,8 +27,7 @@ class Buffer {
     const size_t bytes = (size_t(wanted) * sizeof(T) + page - 1) / page * page;
     data_.reset();
     capacity_ = 0;
-    T* fresh = static_cast<T*>(std::aligned_alloc(page, bytes));
-    if (!fresh) throw std::bad_alloc();
+    T* fresh = static_cast<T*>(allocate(page, bytes));
 #if defined(__linux__)
     if (big) madvise(fresh, bytes, MADV_HUGEPAGE);
 #endif

@@ -18,7 +18,8 @@ struct SurfelFootprint {
   class Entry {
    public:
     Entry(const float* record, const Tile& tile, const LaneOffsets& offsets, const ForwardArgs& args)
-        : record_(record), tile_(tile), offsets_(offsets), least_exponent_(args.camera.log2_min_alpha) {}
+        : record_(record), tile_(tile), offsets_(offsets), least_exponent_(args.camera.log2_min_alpha),
+          low_pass_(args.camera.low_pass) {}
 
     // Which blocks of the tile meet the surfel's bound ellipse or its low-pass disc.
     uint64_t touched() const {
@@ -46,7 +47,7 @@ struct SurfelFootprint {
       r.inverse = reciprocal(max(d, broadcast(1e-18f)));  // D <= 0 never counts: rho_plane overflows, the disc wins
       r.u = (record_[kUx] * r.dx + record_[kUy] * r.dy) * r.inverse;
       r.v = (record_[kVx] * r.dx + record_[kVy] * r.dy) * r.inverse;
-      vfloat rho_plane = r.u * r.u + r.v * r.v, rho_disc = 2.f * (r.dx * r.dx + r.dy * r.dy);
+      vfloat rho_plane = r.u * r.u + r.v * r.v, rho_disc = low_pass_ * (r.dx * r.dx + r.dy * r.dy);
       r.plane = lt(rho_plane, rho_disc) & ge(r.inverse, broadcast(record_[kMinInverse]));
       r.rho = select(r.plane, rho_plane, rho_disc);
       r.exponent = record_[kLogOpacity] - kHalfLog2E * r.rho;
@@ -58,7 +59,7 @@ struct SurfelFootprint {
     const float* record_;
     const Tile& tile_;
     const LaneOffsets& offsets_;
-    float least_exponent_;
+    float least_exponent_, low_pass_;
   };
 
   // ---- forward: the optional outputs ---------------------------------------------------------------------------

@@ -53,7 +53,7 @@ ScreenBound screen_bound(const RasterCamera& camera, const SurfelGeometry& g, vf
   conditional_form(xx, yy, xy, area, s.conditional);
   const BoundField variances[] = {kInvX2, kInvY2, kInvY2GivenX, kInvX2GivenY};
   for (const BoundField k : variances) s.conditional[k] = where(bounded, s.conditional[k]);
-  s.disc2 = reach * 0.50005f + 1e-4f;
+  s.disc2 = reach * (1.0001f / camera.low_pass) + 1e-4f;
   vfloat half_x = sqrt(wide_x), half_y = sqrt(wide_y), disc = sqrt(s.disc2);
   s.left = g.mean_x + select(bounded, min(x - half_x, -disc), -disc);
   s.right = g.mean_x + select(bounded, max(x + half_x, disc), disc);

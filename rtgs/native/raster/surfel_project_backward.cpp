@@ -29,8 +29,8 @@ ParameterGradients chain_rule(const RasterCamera& camera, const SurfelGeometry& 
   const vfloat to_inverse = layout.depth ? rows.field(depth_field) : broadcast(0.f);
   const vfloat to_centre_depth = layout.depth ? rows.field(depth_field + 1) : broadcast(0.f);
   // Projected centre: moves every d, in the plane branch and in the disc.
-  const vfloat to_mean_x = to_u * g.c[0] + to_v * g.c[2] - to_d * g.c[4] + 2.f * sums[kGradDiscX];
-  const vfloat to_mean_y = to_u * g.c[1] + to_v * g.c[3] - to_d * g.c[5] + 2.f * sums[kGradDiscY];
+  const vfloat to_mean_x = to_u * g.c[0] + to_v * g.c[2] - to_d * g.c[4] + camera.low_pass * sums[kGradDiscX];
+  const vfloat to_mean_y = to_u * g.c[1] + to_v * g.c[3] - to_d * g.c[5] + camera.low_pass * sums[kGradDiscY];
   // Coefficients, undoing their normalisation.
   const float ix = 1.f / camera.fx, iy = 1.f / camera.fy;
   const vfloat zero = broadcast(0.f), fx = g.factor * ix, fy = g.factor * iy;
@@ -70,6 +70,8 @@ ParameterGradients chain_rule(const RasterCamera& camera, const SurfelGeometry& 
 
 }  // namespace
 
+void mend_wide_scales(const ProjectBackwardArgs&, const GradientRows&);  // surfel_wide_scales.cpp
+
 void project_backward(const ProjectBackwardArgs& args) {
   const RecordLayout& layout = args.gaussians.layout;
   const GaussianArrays& in = args.inputs;
@@ -85,6 +87,7 @@ void project_backward(const ProjectBackwardArgs& args) {
     rows.write(out.tangent_u, p.tangent_u);
     rows.write(out.tangent_v, p.tangent_v);
     rows.write<2>(out.scales, {p.scale_u, p.scale_v});
+    if (out.scales) mend_wide_scales(args, rows);
     rows.write<1>(out.opacities, {p.opacity});
     rows.write<2>(out.screen_probe, {p.probe_x, p.probe_y});
     rows.write_features(out.features, in.channels, kGradChannels);

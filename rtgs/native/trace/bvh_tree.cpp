@@ -180,16 +180,31 @@ int32_t SurfelTree::build_node(const Range& range) {
 void SurfelTree::build(const SurfelArrays& surfels, float alpha_cutoff, int threads) {
   if (surfels.count >= int64_t(1) << 27)
     throw std::invalid_argument("SurfelTree.build: " + std::to_string(surfels.count) + " surfels, at most 2^27 - 1");
-  measure_boxes(surfels, alpha_cutoff, threads);
-  ids_.resize(surfels.count);
-  Range all = {0, surfels.count, {}};
-  for (int64_t id = 0; id < surfels.count; ++id) {
+  try {
+    measure_boxes(surfels, alpha_cutoff, threads);
+    ids_.resize(surfels.count);
+    build_nodes();
+  } catch (...) {  // no memory: half a tree must not be traced
+    clear();
+    throw;
+  }
+}
+
+void SurfelTree::build_nodes() {
+  Range all = {0, int64_t(ids_.size()), {}};
+  for (size_t id = 0; id < ids_.size(); ++id) {
     ids_[id] = int32_t(id);
     all.bounds.add(boxes_.get()[id]);
   }
   nodes_.clear();
-  if (surfels.count == 0) nodes_.push_back(empty_node());
+  if (ids_.empty()) nodes_.push_back(empty_node());
   else build_node(all);
+}
+
+void SurfelTree::clear() {
+  ids_.clear();
+  nodes_.resize(1);  // there was always one: no memory is asked for
+  nodes_[0] = empty_node();
 }
 
 void SurfelTree::refit_leaves(TreeNode& node) {

@@ -25,6 +25,8 @@ class SurfelTree {
  private:
   struct Range;
   static TreeNode empty_node();
+  void clear();
+  void build_nodes();
   int32_t build_node(const Range& range);
   void split(const Range& range, Range& left, Range& right);
   void measure_boxes(const SurfelArrays& surfels, float alpha_cutoff, int threads);

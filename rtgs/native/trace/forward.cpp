@@ -3,10 +3,9 @@
 // final.
 // Hits of a lane are composited in the order of (t, surfel id), and per-ray sums over surfels run by ascending id, so
 // nothing depends on the shape of the tree.
-#if defined(_OPENMP)
 #include <omp.h>
-#endif
 
+#include "common/rethrow.h"
 #include "trace/sort.h"
 #include "trace/traverse.h"
 
@@ -322,9 +321,11 @@ void PacketTracer::write_tape(PacketTape& tape, TapeArena& arena) {
   int32_t* slots = reinterpret_cast<int32_t*>(arena_take(arena, met_ * sizeof(int32_t)));
   int32_t* places = reinterpret_cast<int32_t*>(arena_take(arena, met_ * sizeof(int32_t)));
   float* weights = reinterpret_cast<float*>(arena_take(arena, met_ * sizeof(float)));
-  memcpy(ids, work_.met_ids.data, met_ * sizeof(int32_t));
-  memcpy(slots, work_.met_slots.data, met_ * sizeof(int32_t));
-  memcpy(places, work_.met_places.data, met_ * sizeof(int32_t));
+  if (met_) {  // else the workspace may own no memory yet
+    memcpy(ids, work_.met_ids.data, met_ * sizeof(int32_t));
+    memcpy(slots, work_.met_slots.data, met_ * sizeof(int32_t));
+    memcpy(places, work_.met_places.data, met_ * sizeof(int32_t));
+  }
   for (int k = 0; k < met_; ++k) weights[k] = sum(load(work_.weights.data + int64_t(places[k]) * kLanes));
   char* rows = arena_take(arena, row_values * (wide ? sizeof(int32_t) : sizeof(uint16_t)));
   for (int64_t i = 0; i < row_values; i += kLanes) {
@@ -352,22 +353,20 @@ int packet_lanes() { return kLanes; }
 void trace_forward(TraceForwardArgs& args) {
   const int64_t packets = packet_count(args.rays);
   int64_t hits = 0;
+  InParallel region;
 #pragma omp parallel num_threads(args.options.threads) reduction(+ : hits) if (args.options.threads > 1)
   {
-#if defined(_OPENMP)
     const int thread = omp_get_thread_num();
-#else
-    const int thread = 0;
-#endif
-    TraceWorkspace& work = workspace_of(args.workspaces, thread);
 #pragma omp for schedule(dynamic, 16)
-    for (int64_t packet = 0; packet < packets; ++packet) {
-      PacketTracer tracer(args, work, packet);
-      tracer.run();
-      tracer.write(args.tapes ? args.tapes + packet : nullptr, args.arenas + thread);
-      hits += tracer.hits();
-    }
+    for (int64_t packet = 0; packet < packets; ++packet)
+      region.run([&] {
+        PacketTracer tracer(args, workspace_of(args.workspaces, thread), packet);
+        tracer.run();
+        tracer.write(args.tapes ? args.tapes + packet : nullptr, args.arenas + thread);
+        hits += tracer.hits();
+      });
   }
+  region.end();
   args.hits = hits;
 }
 

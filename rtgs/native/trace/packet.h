@@ -1,8 +1,8 @@
 // What the tracer's forward and backward passes share: a packet of rays, its workspace, the hit of a surfel.
 #pragma once
-#include <cstdio>
 #include <cstdlib>
 
+#include "common/memory.h"
 #include "gaussians/harmonics.h"
 #include "trace/trace.h"
 #include "trace/surfels.h"
@@ -29,11 +29,7 @@ struct Growing {
  private:
   __attribute__((noinline)) void grow(int64_t count) {
     const int64_t wanted = (2 * count + 63) / 64 * 64;
-    T* larger = static_cast<T*>(aligned_alloc(64, size_t(wanted) * sizeof(T)));
-    if (!larger) {
-      fprintf(stderr, "rtgs tracer: out of memory (%lld bytes for one packet)\n", (long long)(wanted * sizeof(T)));
-      abort();
-    }
+    T* larger = static_cast<T*>(allocate(64, size_t(wanted) * sizeof(T)));
     if (data) memcpy(static_cast<void*>(larger), data, size_t(capacity) * sizeof(T));
     free(data);
     data = larger;
@@ -137,9 +133,8 @@ struct TraceWorkspace {
 
 static inline TraceWorkspace& workspace_of(void** workspaces, int thread) {
   if (!workspaces[thread]) {
-    void* memory = calloc(1, sizeof(TraceWorkspace));
-    if (!memory) abort();
-    workspaces[thread] = memory;
+    const size_t bytes = (sizeof(TraceWorkspace) + 63) / 64 * 64;
+    workspaces[thread] = memset(allocate(64, bytes), 0, bytes);
   }
   return *static_cast<TraceWorkspace*>(workspaces[thread]);
 }

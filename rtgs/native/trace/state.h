@@ -43,7 +43,8 @@ struct TraceMemory {
   }
   void set_threads(int threads) {
     const size_t count = size_t(threads);
-    if (tape_blocks.size() < count) tape_blocks.resize(count), workspaces.resize(count, nullptr);
+    if (tape_blocks.size() < count) tape_blocks.resize(count);
+    if (workspaces.size() < count) workspaces.resize(count, nullptr);
   }
 };
 using TraceMemoryPool = MemoryPool<TraceMemory>;

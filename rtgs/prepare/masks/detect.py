@@ -64,8 +64,8 @@ class PromptTokenizer:
             from tokenizers import Tokenizer
         except ImportError as error:
             raise PrepareError(
-                f"{path.name} needs the package tokenizers: pip install 'rtgs[prepare]', or mark the glass by hand "
-                "(masks=grabcut, masks=polygon)"
+                f"{path.name} needs the package tokenizers: pip install -e '.[prepare]' in the clone of rtgs, or "
+                "mark the glass by hand (masks=grabcut, masks=polygon)"
             ) from error
         try:
             self._tokenizer: Any = Tokenizer.from_file(str(path))

@@ -60,8 +60,10 @@ class Drawing:
         return tuple(sorted({*self.cutouts, *(name for corners in self.panes.values() for name in corners)}))
 
 
-def read_drawing(path: Path, views: Iterable[str]) -> Drawing:
+def read_drawing(path: Path, views: Iterable[str] | None) -> Drawing:
     """Read a file of marks; photos may be named in full, without sub-folder, or without suffix.
+
+    ``views``: the names of the photos; None: nobody knows them yet, and any name is taken.
 
     Raises:
         PrepareError: not there, not of this form, or about photos the capture does not have.
@@ -70,7 +72,7 @@ def read_drawing(path: Path, views: Iterable[str]) -> Drawing:
     units = content.get("units", "pixels")
     if units not in UNITS:
         raise PrepareError(f"{path}: units={shown(units)} is unknown: choose one of {', '.join(UNITS)}")
-    names = tuple(views)
+    names = None if views is None else tuple(views)
     panes = {
         str(pane): {
             _photo(path, photo, names): _points(path, f"pane {str(pane)[:80]}, {str(photo)[:80]}", corners, least=3)
@@ -132,9 +134,9 @@ def _mapping(path: Path, where: str, value: object) -> Mapping[Any, Any]:
     return value
 
 
-def _photo(path: Path, named: object, views: tuple[str, ...]) -> str:
+def _photo(path: Path, named: object, views: tuple[str, ...] | None) -> str:
     text = str(named)
-    if text in views:
+    if views is None or text in views:
         return text
     plain = {text, Path(text).stem if Path(text).suffix else text}
     plain |= {re.sub(r"\s", "_", name) for name in plain}  # as photos without poses are named

@@ -11,6 +11,7 @@ import numpy as np
 from PIL import Image, PngImagePlugin
 
 from rtgs.core.documents import parse_json
+from rtgs.core.files import whole_file
 from rtgs.core.recipe import canonical_json
 from rtgs.prepare.errors import PrepareError
 from rtgs.prepare.masks.detect import Box, Detector, PromptTokenizer
@@ -146,9 +147,8 @@ def _keep(inside: np.ndarray, boxes: tuple[Box, ...], path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     words = PngImagePlugin.PngInfo()
     words.add_text(_NOTE, json.dumps([asdict(box) for box in boxes]))
-    partial = path.with_name(f"{path.name}.part")
-    Image.fromarray(inside.astype(np.uint8) * 255).save(partial, "PNG", pnginfo=words)
-    partial.replace(path)
+    with whole_file(path) as partial:
+        Image.fromarray(inside.astype(np.uint8) * 255).save(partial, "PNG", pnginfo=words)
 
 
 def _kept_boxes(path: Path) -> tuple[Box, ...]:

@@ -165,7 +165,7 @@ def _predict(
 
 def _pinhole_part(lens: Lens) -> tuple[float, ...]:
     """fx, fy, cx, cy of a distorted lens, in the distorted image."""
-    import pycolmap
+    from rtgs.core.colmap import pycolmap
 
     camera = pycolmap.Camera(model=lens.model, width=lens.width, height=lens.height, params=list(lens.params))
     return camera.focal_length_x, camera.focal_length_y, camera.principal_point_x, camera.principal_point_y

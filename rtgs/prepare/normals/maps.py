@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rtgs.core.files import whole_file
 from rtgs.prepare.errors import PrepareError
 from rtgs.prepare.normals.adapters import NormalAdapter
 from rtgs.prepare.onnx import Network
@@ -237,7 +238,5 @@ def save_normals(normals: np.ndarray, path: Path) -> None:
     """Write canonical normals as ``.npy`` of half floats (a thousandth of a radian), for
     :func:`rtgs.scenes.images.read_normals`."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f"{path.name}.part")
-    with partial.open("wb") as stream:
+    with whole_file(path) as partial, partial.open("wb") as stream:
         np.save(stream, normals.astype(np.float16))
-    partial.replace(path)

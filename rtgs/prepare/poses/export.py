@@ -33,7 +33,7 @@ def write_capture(model: Any, pictures: Path, out: Path, work: Path, quality: in
     Raises:
         PrepareError: the lens cannot be undistorted, or the disk refuses.
     """
-    import pycolmap
+    from rtgs.core.colmap import pycolmap
 
     distorted, flat = work / "distorted", work / "undistorted"
     for folder in (distorted, flat):

@@ -103,7 +103,7 @@ def require_pycolmap() -> None:
     Raises:
         PrepareError: names both versions.
     """
-    import pycolmap
+    from rtgs.core.colmap import pycolmap
 
     version = tuple(int(part) for part in pycolmap.__version__.split(".")[:2])
     if version < MIN_PYCOLMAP:
@@ -135,14 +135,15 @@ def _frames(request: Request, settings: SfmSettings, work: Path, notes: list[str
     if not done.exists():
         shutil.rmtree(folder, ignore_errors=True)
         ticker = Ticker(say, f"looking at {request.source.name}", 0)
-        seen = look_at_frames(request.source, settings.video, ticker)
+        breaks: list[str] = []
+        seen = look_at_frames(request.source, settings.video, ticker, breaks.append)
         chosen = select_frames(seen, settings.video)
         write_frames(request.source, chosen, folder, settings.video, Ticker(say, "writing frames", len(chosen)))
-        done.write_text(
-            f"{len(chosen)} of {seen[-1].index + 1} frames of {request.source.name} are used: the sharpest of each "
-            "stretch of equal motion\n",
-            encoding="utf-8",
-        )
+        used = f"{len(chosen)} of {seen[-1].index + 1} frames of {request.source.name} are used: the sharpest of each "
+        note = "; ".join([f"{used}stretch of equal motion", *breaks])
+        whole = done.with_suffix(".tmp")  # a kill between the two leaves frames that are written anew
+        whole.write_text(f"{note}\n", encoding="utf-8")
+        whole.replace(done)
     note = done.read_text(encoding="utf-8").strip()
     notes.append(note)
     say(note)

@@ -153,7 +153,8 @@ def _inspect(path: Path, folder: Path, taken: set[str]) -> Photo:
     heic = path.suffix.lower() in HEIC_SUFFIXES
     if heic and not open_heic():
         raise PrepareError(
-            f"{relative}: HEIC needs the package pillow-heif: pip install 'rtgs[prepare]', or export JPEG"
+            f"{relative}: HEIC needs the package pillow-heif: pip install -e '.[prepare]' in the clone of rtgs, or "
+            "export JPEG"
         )
     if path.stat().st_size == 0:
         raise PrepareError(f"{relative}: an empty file (0 bytes)")

@@ -68,7 +68,7 @@ class Reconstructed:
 @contextmanager
 def quiet() -> Iterator[None]:
     """COLMAP says only what went wrong."""
-    import pycolmap
+    from rtgs.core.colmap import pycolmap
 
     before = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = _LOG_ERRORS
@@ -86,7 +86,7 @@ def reconstruct(
     Raises:
         PrepareError: a model file of the features is missing, or COLMAP failed.
     """
-    import pycolmap
+    from rtgs.core.colmap import pycolmap
 
     pycolmap.set_random_seed(settings.seed)
     _register(photos, place, settings)
@@ -100,7 +100,7 @@ def reconstruct(
 
 def _register(photos: PhotoSet, place: Workplace, settings: SfmSettings) -> None:
     """Enter photos in name order, one camera for each size and EXIF focal length."""
-    import pycolmap
+    from rtgs.core.colmap import pycolmap
 
     if place.database.exists():
         with pycolmap.Database.open(str(place.database)) as database:
@@ -125,7 +125,7 @@ def _register(photos: PhotoSet, place: Workplace, settings: SfmSettings) -> None
 
 
 def _extract(photos: PhotoSet, place: Workplace, settings: SfmSettings, threads: int, say: Say) -> float:
-    import pycolmap
+    from rtgs.core.colmap import pycolmap
 
     wanted = settings.features
     options = pycolmap.FeatureExtractionOptions()
@@ -177,7 +177,7 @@ def _choose_pairs(
 
 def _signatures(photos: PhotoSet, place: Workplace, settings: SfmSettings) -> np.ndarray:
     """(N, D) unit VLAD signatures; one photo's descriptors in memory at a time."""
-    import pycolmap
+    from rtgs.core.colmap import pycolmap
 
     rng = np.random.default_rng(settings.seed)
     with pycolmap.Database.open(str(place.database)) as database:
@@ -204,7 +204,7 @@ def _match(
     threads: int,
     say: Say,
 ) -> float:
-    import pycolmap
+    from rtgs.core.colmap import pycolmap
 
     options = pycolmap.FeatureMatchingOptions()
     options.num_threads = threads
@@ -239,15 +239,20 @@ def _match(
 
 def _map(photos: PhotoSet, place: Workplace, settings: SfmSettings, say: Say) -> tuple[list[Any], float]:
     """COLMAP's models, most photos first, of the best attempt; demands fall until one is good."""
-    ticker = Ticker(say, "photos with a pose", len(photos.photos))
+    total = len(photos.photos)
+    # Each photo makes the next one dearer, and all of them are adjusted together in the end: no time left is told.
+    ticker = Ticker(say, "photos with a pose", total, even=False)
     best: list[Any] = []
     for trial in range(settings.mapping.init_trials):
+        if trial:
+            found = f"{best[0].num_reg_images() if best else 0} of {total} photos have a pose"
+            say(f"{found}: attempt {trial + 1} of {settings.mapping.init_trials}, which demands less, begins anew")
         shutil.rmtree(place.models, ignore_errors=True)
         place.models.mkdir(parents=True)
         if settings.mapping.mapper == "global":
             models = _global(place, settings)
         else:
-            models = _incremental(place, settings, 0.5**trial, ticker)
+            models = _incremental(place, settings, 0.5**trial, _Registered(total, ticker, say))
         models = [model for model in models if _counts(model, settings)]
         models.sort(key=_size, reverse=True)
         if models and (not best or _size(models[0]) > _size(best[0])):
@@ -276,8 +281,30 @@ def _is_good(model: Any, photos: PhotoSet, settings: SfmSettings) -> bool:
     return model.num_reg_images() >= wanted.enough * len(photos.photos) and error <= wanted.good_error
 
 
-def _incremental(place: Workplace, settings: SfmSettings, leniency: float, ticker: Ticker) -> list[Any]:
-    import pycolmap
+class _Registered:
+    """Counts the photos of the model that COLMAP is at, and says when another model or the last long step begins."""
+
+    def __init__(self, total: int, ticker: Ticker, say: Say) -> None:
+        self._total, self._ticker, self._say = total, ticker, say
+        self._models = self._count = 0
+
+    def begin(self) -> None:
+        """The first two photos of a model."""
+        if self._models:
+            self._say(f"{self._count} photos are one model; the others are tried as another one")
+        self._models += 1
+        self._count = 2
+
+    def add(self) -> None:
+        """One more photo."""
+        self._count += 1
+        self._ticker(self._count)
+        if self._count == self._total:
+            self._say(f"all {self._total} photos have a pose; they are adjusted together, which takes a while")
+
+
+def _incremental(place: Workplace, settings: SfmSettings, leniency: float, registered: _Registered) -> list[Any]:
+    from rtgs.core.colmap import pycolmap
 
     wanted = settings.mapping
     options = pycolmap.IncrementalPipelineOptions()
@@ -293,16 +320,14 @@ def _incremental(place: Workplace, settings: SfmSettings, leniency: float, ticke
     options.mapper.abs_pose_min_inlier_ratio = wanted.pose_min_ratio * leniency
     if leniency < 1:
         options.min_num_matches = min(settings.matching.min_inliers, _MIN_POSE_INLIERS)
-    registered = 2
-
-    def next_image() -> None:
-        nonlocal registered
-        registered += 1
-        ticker(registered)
-
     try:
         models = pycolmap.incremental_mapping(
-            str(place.database), str(place.photos), str(place.models), options, next_image_callback=next_image
+            str(place.database),
+            str(place.photos),
+            str(place.models),
+            options,
+            initial_image_pair_callback=registered.begin,
+            next_image_callback=registered.add,
         )
     except (RuntimeError, ValueError) as error:
         raise PrepareError(f"COLMAP's mapper failed: {_first_line(error)}") from error
@@ -310,7 +335,7 @@ def _incremental(place: Workplace, settings: SfmSettings, leniency: float, ticke
 
 
 def _global(place: Workplace, settings: SfmSettings) -> list[Any]:
-    import pycolmap
+    from rtgs.core.colmap import pycolmap
 
     options = pycolmap.GlobalPipelineOptions()
     options.random_seed = options.mapper.random_seed = settings.seed
@@ -326,7 +351,7 @@ def _global(place: Workplace, settings: SfmSettings) -> list[Any]:
 
 def match_counts(names: Sequence[str], place: Workplace) -> np.ndarray:
     """(N, N) int64: verified matches between each two photos."""
-    import pycolmap
+    from rtgs.core.colmap import pycolmap
 
     counts = np.zeros((len(names), len(names)), dtype=np.int64)
     with pycolmap.Database.open(str(place.database)) as database:
@@ -346,7 +371,7 @@ def _image_id(database: Any, name: str) -> int:
 
 def keypoint_counts(names: Sequence[str], place: Workplace) -> np.ndarray:
     """(N,) int64: keypoints of each photo."""
-    import pycolmap
+    from rtgs.core.colmap import pycolmap
 
     with pycolmap.Database.open(str(place.database)) as database:
         numbers = [_image_id(database, name) for name in names]
@@ -355,7 +380,7 @@ def keypoint_counts(names: Sequence[str], place: Workplace) -> np.ndarray:
 
 def turning_share(place: Workplace) -> float:
     """Share of the verified pairs that a turning camera without parallax explains (COLMAP's PANORAMIC)."""
-    import pycolmap
+    from rtgs.core.colmap import pycolmap
 
     turning = {
         pycolmap.TwoViewGeometryConfiguration.PANORAMIC,

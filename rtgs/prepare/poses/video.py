@@ -12,10 +12,13 @@ import numpy as np
 
 from rtgs.prepare.errors import PrepareError
 from rtgs.prepare.settings import VideoSettings
+from rtgs.scenes.images import refuse_pixels
 
 _LOOK_SIDE = 320  # pixels; long side at which motion and sharpness are measured
 _CORNERS = 200
 _FEW_CORNERS = 12
+_UNCERTAIN = 0.02  # share of the frames that a header counts which a whole file may lack: edits cut them away
+_UNCERTAIN_RATE = 0.1  # likewise where only the duration is known, which may be that of the sound
 _LOST = 0.5  # long sides; motion between candidates whose corners cannot be followed: a cut, or a fast pan
 
 
@@ -54,11 +57,19 @@ def select_frames(candidates: list[Candidate], settings: VideoSettings) -> list[
     return [best[part] for part in sorted(best)]
 
 
-def look_at_frames(path: Path, settings: VideoSettings, advance: Callable[[int, int], None]) -> list[Candidate]:
+def look_at_frames(
+    path: Path,
+    settings: VideoSettings,
+    advance: Callable[[int, int], None],
+    tell: Callable[[str], None] = lambda _: None,
+) -> list[Candidate]:
     """Decode the video once, small, and measure its frames. ``advance`` gets (frames seen, frames there are or 0).
 
+    A video that breaks off gives the frames before the break; ``tell`` gets a sentence that says so.
+
     Raises:
-        PrepareError: no PyAV, no video, or no frame in it.
+        PrepareError: no PyAV, no video, no frame in it, or frames of several sizes.
+        CaptureError: frames of more pixels than any photo has.
     """
     candidates: list[Candidate] = []
     before: np.ndarray | None = None
@@ -66,7 +77,7 @@ def look_at_frames(path: Path, settings: VideoSettings, advance: Callable[[int, 
         rate = float(stream.average_rate or 0) or 30.0
         total = int(stream.frames or 0)
         every = max(1, round(rate / settings.candidates_per_second))
-        for index, frame in enumerate(_decoded(stream, path)):
+        for index, frame in enumerate(_decoded(stream, path, tell)):
             if index % every:
                 continue
             grey = _small_grey(frame)
@@ -156,8 +167,8 @@ def _opened(path: Path) -> Iterator[Any]:
         from av.error import FFmpegError
     except ImportError as error:
         raise PrepareError(
-            f"{path.name} is a video, and reading it needs the package av: pip install 'rtgs[prepare]', or cut it into "
-            "photos yourself (ffmpeg -i video.mp4 -vf fps=2 photos/%04d.jpg)"
+            f"{path.name} is a video, and reading it needs the package av: pip install -e '.[prepare]' in the clone of "
+            "rtgs, or cut it into photos yourself (ffmpeg -i video.mp4 -vf fps=2 photos/%04d.jpg)"
         ) from error
     if not path.is_file():
         raise PrepareError(f"video {path} does not exist: correct scene.path")
@@ -171,19 +182,46 @@ def _opened(path: Path) -> Iterator[Any]:
         if not container.streams.video:
             raise PrepareError(f"{path} holds no video stream: correct scene.path")
         stream = container.streams.video[0]
+        if stream.codec_context is None:
+            raise PrepareError(f"video {path}: no decoder here knows its pictures; export it again as MP4 (H.264)")
+        refuse_pixels((stream.width, stream.height), path)
         stream.thread_type = "AUTO"
         yield stream
 
 
-def _decoded(stream: Any, path: Path) -> Iterator[Any]:
-    """Frames in order; a video that breaks off gives those before the break."""
+def _decoded(stream: Any, path: Path, tell: Callable[[str], None] = lambda _: None) -> Iterator[Any]:
+    """Frames in order, all of one size; a video that breaks off gives those before the break, and tells."""
     from av.error import FFmpegError
 
-    count = 0
+    count, first = 0, (0, 0)
     try:
         for frame in stream.container.decode(stream):
+            size = (frame.width, frame.height)
+            first = first if count else size
+            if size != first:
+                raise PrepareError(
+                    f"video {path}: frame {count} has {size[0]}x{size[1]} pixels, those before it "
+                    f"{first[0]}x{first[1]}; export it again with one size, or cut it there"
+                )
             count += 1
             yield frame
     except FFmpegError as error:
         if not count:
             raise PrepareError(f"video {path} cannot be decoded ({error}): export it again as MP4 (H.264)") from error
+        tell(f"video {path} breaks off after {count} frames ({error}): what follows is not used")
+        return
+    promised = _promised_frames(stream)
+    if count and count < promised:
+        tell(
+            f"video {path} breaks off after {count} of at least {promised} frames: what follows is not used; copy it "
+            "again if it is longer"
+        )
+
+
+def _promised_frames(stream: Any) -> int:
+    """Fewest frames that a whole file has by its own header, with room for what cuts and uneven rates leave out; 0: it
+    does not say."""
+    if stream.frames:
+        return round(stream.frames * (1 - _UNCERTAIN)) - 1
+    seconds = float(stream.duration * stream.time_base) if stream.duration else (stream.container.duration or 0) / 1e6
+    return round(seconds * float(stream.average_rate or 0) * (1 - _UNCERTAIN_RATE)) - 1

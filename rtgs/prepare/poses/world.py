@@ -38,7 +38,7 @@ class WorldChange:
 
     def apply_to(self, model: Any) -> None:
         """Move a ``pycolmap.Reconstruction`` in place."""
-        import pycolmap
+        from rtgs.core.colmap import pycolmap
 
         matrix = np.concatenate([self.scale * np.asarray(self.rotation), np.asarray(self.translation)[:, None]], axis=1)
         model.transform(pycolmap.Sim3d(matrix))

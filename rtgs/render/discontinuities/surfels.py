@@ -24,6 +24,7 @@ from rtgs.render.reference.surfels import (
     pixel_chunks,
     project,
 )
+from rtgs.render.surfel_filter import convolve_surfels, drawn_options
 
 
 @dataclass(frozen=True)
@@ -58,17 +59,23 @@ def discontinuity_mask(
 
     Flagged, for surfels met before the pixel stops: alpha_raw at the cut or at the clamp; T at its cutoff; a visible
     hit at the near plane; rho_plane = rho_disc; centre depths that float32 may order differently; a centre at the near
-    plane; with ``options.median_depth`` T at 0.5; with ``options.normal`` a surfel seen edge-on.
+    plane; with ``options.median_depth`` T at 0.5; with ``options.normal`` or ``options.convolved`` a surfel seen
+    edge-on.
     """
+    edge_on = torch.zeros(len(means), dtype=torch.bool)
+    if options.normal or options.convolved:
+        edge_on = seen_edge_on(means, tangent_u, tangent_v, camera, bands.facing)
+    if options.convolved:
+        surfels = (means, tangent_u, tangent_v, scales, opacities)
+        tangent_u, tangent_v, opacities = convolve_surfels(*surfels, camera, options.low_pass, options.near)
+        scales, options = (scales > 0).to(scales.dtype), drawn_options(options)
     local = camera.to_camera(means)
     rounding = bands.depth * depth_terms(means, camera)
     near, alpha_cut = options.near - rounding, options.alpha_cutoff - bands.alpha
     keep = kept_surfels(local, tangent_u, tangent_v, scales, opacities, features, near, opacity_cut=alpha_cut)
     surfels = project(local, means, tangent_u, tangent_v, scales, opacities, features, camera, keep)
     rounding = rounding[keep]
-    fragile = (surfels.depth - options.near).abs() <= rounding
-    if options.normal:
-        fragile |= seen_edge_on(means[keep], tangent_u[keep], tangent_v[keep], camera, bands.facing)
+    fragile = ((surfels.depth - options.near).abs() <= rounding) | edge_on[keep]
     flags = []
     for chunk in pixel_chunks(pixel_centers(camera, means), len(keep)):
         # a hit just before the near plane is evaluated too, so that what it would show is flagged

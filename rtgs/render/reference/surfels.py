@@ -22,6 +22,8 @@ from torch.utils.checkpoint import checkpoint
 from rtgs.core.cameras import Camera
 from rtgs.render.arguments import check_shapes
 from rtgs.render.buffers import RasterBuffers, RasterOptions
+from rtgs.render.reference.surfel_filter import convolve_surfels
+from rtgs.render.surfel_filter import rasterize_convolved
 
 ALPHA_CUT = 1 / 255  # the default: a contribution below it is skipped (Kerbl et al. 2023; method.md 3.1)
 ALPHA_MAX = 0.99  # keeps 1 / (1 - alpha) <= 100 (method.md 14)
@@ -89,6 +91,10 @@ def rasterize_surfels(
         ValueError: when a shape does not fit.
     """
     check_shapes(means, tangent_u, tangent_v, scales, opacities, features, background, screen_probe)
+    if options.convolved:
+        surfels = (means, tangent_u, tangent_v, scales, opacities)
+        seen = (features, camera, background, options, screen_probe)
+        return rasterize_convolved(rasterize_surfels, convolve_surfels, surfels, *seen)
     local = camera.to_camera(means)
     if screen_probe is not None:
         local = attach_probe(local, screen_probe, camera)
@@ -243,7 +249,7 @@ def decide(surfels: ProjectedSurfels, pixels: Tensor, options: RasterOptions) ->
     hit_depth = torch.where(ahead, surfels.depth * surfels.determinant / safe, 0.0)
     counts = ahead & (hit_depth >= options.near)
     rho_plane = torch.where(counts, (numerator / safe.unsqueeze(-1)).square().sum(-1), torch.inf)
-    rho_disc = 2 * offset.square().sum(-1)
+    rho_disc = offset.square().sum(-1) / options.low_pass
     alpha_raw = surfels.opacity * torch.exp(-0.5 * torch.minimum(rho_plane, rho_disc))
     visible = alpha_raw >= options.alpha_cutoff
     before = transmittance_before(torch.where(visible, alpha_raw.clamp_max(ALPHA_MAX), 0.0))[:, :-1]
@@ -258,7 +264,9 @@ def decide(surfels: ProjectedSurfels, pixels: Tensor, options: RasterOptions) ->
     )
 
 
-def alpha_and_depth(surfels: ProjectedSurfels, pixels: Tensor, decisions: PixelDecisions) -> tuple[Tensor, Tensor]:
+def alpha_and_depth(
+    surfels: ProjectedSurfels, pixels: Tensor, decisions: PixelDecisions, low_pass: float
+) -> tuple[Tensor, Tensor]:
     """Differentiable alpha (P, K), 0 where the surfel does not contribute, and depth (P, K) of the contribution."""
     plane = decisions.contributes & decisions.plane
     disc = decisions.contributes & ~decisions.plane
@@ -267,7 +275,7 @@ def alpha_and_depth(surfels: ProjectedSurfels, pixels: Tensor, decisions: PixelD
     safe = torch.where(plane, denominator, 1.0)
     uv = torch.where(plane.unsqueeze(-1), numerator, 0.0) / safe.unsqueeze(-1)
     disc_offset = torch.where(disc.unsqueeze(-1), offset, 0.0)
-    rho = uv.square().sum(-1) + 2 * disc_offset.square().sum(-1)  # one of the two is zero
+    rho = uv.square().sum(-1) + disc_offset.square().sum(-1) / low_pass  # one of the two is zero
     alpha_raw = surfels.opacity * torch.exp(-0.5 * rho)
     alpha = torch.where(alpha_raw < ALPHA_MAX, alpha_raw, ALPHA_MAX)  # no gradient where the clamp binds
     hit_depth = surfels.depth * surfels.determinant / safe
@@ -281,7 +289,7 @@ def composite(surfels: ProjectedSurfels, pixels: Tensor, options: RasterOptions)
     detached sum of weights (K,).
     """
     decisions = decide(surfels, pixels, options)
-    alpha, depth = alpha_and_depth(surfels, pixels, decisions)
+    alpha, depth = alpha_and_depth(surfels, pixels, decisions, options.low_pass)
     transmittance = transmittance_before(alpha)
     weight = alpha * transmittance[:, :-1]
     scalars = torch.stack(

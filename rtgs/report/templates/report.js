@@ -5,12 +5,20 @@ for (const compare of document.querySelectorAll(".compare")) {
   place();
 }
 const box = document.getElementById("lightbox");
-for (const button of document.querySelectorAll(".enlarge")) {
-  button.addEventListener("click", () => {
-    const caption = button.parentElement.querySelector("figcaption");
-    box.querySelector("img").src = button.querySelector("img").src;
-    box.querySelector("p").textContent = caption ? caption.textContent.trim().replace(/\s+/g, " ") : "";
-    box.showModal();
-  });
-}
+const buttons = [...document.querySelectorAll(".enlarge")];
+let shown = 0;
+const show = (index) => {
+  shown = (index + buttons.length) % buttons.length;
+  const picture = buttons[shown].querySelector("img");
+  const large = box.querySelector("img");
+  large.src = picture.src;
+  large.alt = picture.alt;
+  box.querySelector("p").textContent = buttons[shown].dataset.caption;
+};
+buttons.forEach((button, index) => button.addEventListener("click", () => { show(index); box.showModal(); }));
 box.addEventListener("click", () => box.close());
+box.addEventListener("close", () => buttons[shown].focus());
+box.addEventListener("keydown", (event) => {
+  const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
+  if (step) { event.preventDefault(); show(shown + step); }
+});

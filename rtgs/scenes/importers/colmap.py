@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from rtgs.core.names import path_inside, refuse_name
+from rtgs.core.refuse import cut
 from rtgs.scenes.capture import Capture, CaptureView, Finding, PointCloud, existing_side_file, list_some
 from rtgs.scenes.images import IMAGE_SUFFIXES, MASK_SUFFIXES, NORMAL_SUFFIXES, image_size
 from rtgs.scenes.importers.colmap_files import DamagedModel, check_files
@@ -92,7 +93,7 @@ def _read_model(folder: Path) -> Any:
             check_files(folder)
         except (DamagedModel, OSError) as error:
             raise _unreadable(folder, error) from error
-    import pycolmap
+    from rtgs.core.colmap import pycolmap
 
     try:
         model = pycolmap.Reconstruction(str(folder))
@@ -142,7 +143,7 @@ def _non_finite_lines(folder: Path) -> list[str]:
 
 def _first_line(error: Exception) -> str:
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return lines[0] if lines else type(error).__name__
+    return cut(lines[0], 200) if lines else type(error).__name__  # COLMAP repeats words of the file
 
 
 def _lens(camera: Any, folder: Path) -> Lens:

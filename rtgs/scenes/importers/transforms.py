@@ -269,7 +269,8 @@ def read_point_file(path: Path) -> PointCloud:
 
 
 def _float_columns(rows: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
-    return np.stack([np.asarray(rows[name]).astype(np.float64) for name in names], axis=1)
+    with np.errstate(invalid="ignore"):  # a signalling NaN stays a NaN
+        return np.stack([np.asarray(rows[name]).astype(np.float64) for name in names], axis=1)
 
 
 def _own_split(content: dict[str, Any], names: list[str], path: Path) -> dict[str, str]:

@@ -11,7 +11,7 @@ import json
 import shutil
 import time
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from rtgs.core.cameras import Camera
+from rtgs.core.recipe import left_out_at
 from rtgs.scenes.synthetic.assemble import SPECULAR, TRANSPARENT
 from rtgs.scenes.synthetic.colmap_text import write_colmap_text
 from rtgs.scenes.synthetic.description import SceneDescription
@@ -51,7 +52,11 @@ def to_srgb(linear: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 def description_digest(description: SceneDescription) -> str:
     """SHA-256 of what a description means, whatever file it was read from."""
-    return hashlib.sha256(json.dumps(asdict(description), sort_keys=True).encode()).hexdigest()
+    meaning = asdict(description)
+    for item in fields(description.viewpoints):  # what was added later and is not used leaves the digest as it was
+        if getattr(description.viewpoints, item.name) == left_out_at(item):
+            del meaning["viewpoints"][item.name]
+    return hashlib.sha256(json.dumps(meaning, sort_keys=True).encode()).hexdigest()
 
 
 def write_capture(
@@ -62,6 +67,7 @@ def write_capture(
     *,
     variant: str | None = None,
     progress: Progress | None = None,
+    test_views_of: CaptureRecord | None = None,
 ) -> CaptureRecord:
     """Path-trace the scene and write the capture. Deterministic for a seed on one Mitsuba variant.
 
@@ -72,13 +78,15 @@ def write_capture(
         settings: size, samples, side files.
         variant: of Mitsuba; None: the fastest here.
         progress: told of every view.
+        test_views_of: the record of an earlier capture that the test views in ``work`` were copied from, which knows
+            their noise (``retake.py``).
 
     Raises:
         RtgsError: Mitsuba or the wanted variant is not there.
         OSError: a file cannot be written (disk full); finished views stay in ``work``.
     """
     settings = settings or CaptureSettings()
-    tracer = PathTracer(description, settings.seed, variant, LightmapSettings() if settings.lightmap else None)
+    tracer = tracer_of(description, settings, variant)
     views = make_cameras(description.viewpoints, settings.width, settings.height, settings.seed)
     for leftover in work.glob("*.tmp"):
         shutil.rmtree(leftover)
@@ -95,7 +103,14 @@ def write_capture(
         left -= cost[index]
     tell("points", 1.0)
     records = [ViewRecord.read(work / camera.name) for camera in views]
-    return _assemble(tracer, views, records, settings, folder, work)
+    record = _assemble(tracer, views, records, settings, folder, work, test_views_of)
+    record.write(folder)
+    return record
+
+
+def tracer_of(description: SceneDescription, settings: CaptureSettings, variant: str | None) -> PathTracer:
+    """What renders the views of a capture; ``variant`` of Mitsuba, None: the fastest here."""
+    return PathTracer(description, settings.seed, variant, LightmapSettings() if settings.lightmap else None)
 
 
 def _write_view(tracer: PathTracer, camera: Camera, index: int, settings: CaptureSettings, folder: Path) -> None:
@@ -193,8 +208,9 @@ def _assemble(
     settings: CaptureSettings,
     folder: Path,
     work: Path,
+    test_views_of: CaptureRecord | None,
 ) -> CaptureRecord:
-    """Copy the finished views to where captures have them; points, model and record beside them."""
+    """Copy the finished views to where captures have them; points and model beside them."""
     for camera in views:
         for path in (work / camera.name).iterdir():
             if side := _SIDES.get(path.stem):
@@ -213,15 +229,17 @@ def _assemble(
     named = [(camera, record.image) for camera, record in zip(views, records)]
     write_colmap_text(folder / "sparse" / "0", named, points, colors)
     shrink_pictures(folder)
-    record = _capture_record(tracer, records, settings, len(points))
-    record.write(folder)
-    return record
+    return _capture_record(tracer, records, settings, len(points), test_views_of)
 
 
 def _capture_record(
-    tracer: PathTracer, views: list[ViewRecord], settings: CaptureSettings, points: int
+    tracer: PathTracer,
+    views: list[ViewRecord],
+    settings: CaptureSettings,
+    points: int,
+    test_views_of: CaptureRecord | None,
 ) -> CaptureRecord:
-    noise = noise_psnrs(views)
+    noise, copied = noise_psnrs(views), test_views_of
     description = tracer.description
     return CaptureRecord(
         name=description.name,
@@ -237,8 +255,8 @@ def _capture_record(
         seed=settings.seed,
         points=points,
         seconds=round(sum(view.seconds for view in views), 1),
-        noise_psnr=round(float(np.mean(noise)), 2),
-        noise_psnr_worst=round(float(np.min(noise)), 2),
+        noise_psnr=copied.noise_psnr if copied else round(float(np.mean(noise)), 2),
+        noise_psnr_worst=copied.noise_psnr_worst if copied else round(float(np.min(noise)), 2),
         masked=round(float(np.mean([view.masked for view in views])), 4),
         specular=round(float(np.mean([view.specular for view in views])), 4),
         reflected_in_mask=weighted_share(views, "reflected_in_mask", "masked"),

@@ -14,6 +14,7 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from rtgs.core.documents import DocumentError, load_toml
 from rtgs.core.errors import RtgsError
+from rtgs.core.recipe import UNLESS_DEFAULT
 from rtgs.core.refuse import shown
 
 SCENES = Path(__file__).parent / "scenes"
@@ -99,6 +100,16 @@ class Viewpoints:
     arc: float = 360.0  # degrees of azimuth that the rings cover
     jitter: float = 0.05  # share of the radius
     field_of_view: float = 50.0  # degrees, horizontal
+    wide_every: int = field(
+        default=0, metadata=UNLESS_DEFAULT
+    )  # one view of so many is taken from low with a wide lens
+    wide_elevation: tuple[float, float] = field(default=(10.0, 30.0), metadata=UNLESS_DEFAULT)  # as ``elevation``
+    wide_field_of_view: float = field(default=90.0, metadata=UNLESS_DEFAULT)  # degrees, horizontal
+
+    def is_wide(self, index: int) -> bool:
+        """Whether a view has the wide lens: the one in the middle of every ``wide_every``, so that none is a test view
+        where one of a multiple of so many is, the first of them."""
+        return self.wide_every > 1 and index % self.wide_every == self.wide_every // 2
 
 
 @dataclass(frozen=True)
@@ -224,16 +235,23 @@ def _check_shape(shape: Shape, where: str) -> None:
 
 
 def _check_viewpoints(viewpoints: Viewpoints, where: str) -> None:
-    nearest, angle = min(viewpoints.radius), viewpoints.field_of_view
-    _check_positive(where, count=viewpoints.count, rings=viewpoints.rings, radius=nearest, field_of_view=angle)
-    if angle >= 180:
-        raise ValueError(f"{where}: field_of_view = {angle:g} must be below 180 degrees")
+    _check_positive(where, count=viewpoints.count, rings=viewpoints.rings, radius=min(viewpoints.radius))
+    for name in ("field_of_view", "wide_field_of_view"):
+        angle = getattr(viewpoints, name)
+        _check_positive(where, **{name: angle})
+        if angle >= 180:
+            raise ValueError(f"{where}: {name} = {angle:g} must be below 180 degrees")
     _check_range(where, 1, _MOST_VIEWS, count=viewpoints.count, rings=viewpoints.rings)
     _check_range(where, -_FARTHEST, _FARTHEST, target=viewpoints.target, radius=viewpoints.radius)
     _check_range(where, 0, 1, jitter=viewpoints.jitter)
-    steepest = max(abs(elevation) for elevation in viewpoints.elevation)
-    if steepest >= 90:
-        raise ValueError(f"{where}: elevation = {steepest:g} must be below 90 degrees, where up has no direction")
+    if viewpoints.wide_every not in (0, *range(2, _MOST_VIEWS + 1)):
+        raise ValueError(
+            f"{where}: wide_every = {viewpoints.wide_every} must be 0 (no wide lens) or 2 to {_MOST_VIEWS}"
+        )
+    for name in ("elevation", "wide_elevation"):
+        steepest = max(abs(elevation) for elevation in getattr(viewpoints, name))
+        if steepest >= 90:
+            raise ValueError(f"{where}: {name} = {steepest:g} must be below 90 degrees, where up has no direction")
 
 
 def _check_choice(value: str, allowed: tuple[str, ...], where: str) -> None:

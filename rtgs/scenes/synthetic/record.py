@@ -76,6 +76,15 @@ class CaptureRecord:
         return f"{name} (stand-in)" if self.stand_in_for else name
 
     @property
+    def photo_noise_psnr(self) -> float:
+        """PSNR in dB of the training photos against a converged render, before JPEG: the noise of the test views falls
+        with the samples, so that of fewer is as many times larger. An estimate; nothing of the photos is measured."""
+        from rtgs.scenes.synthetic.noise import ROUNDING, psnr
+
+        tests = max(10 ** (-self.noise_psnr / 10) - ROUNDING, 0.0)
+        return psnr(tests * self.test_samples / self.samples + ROUNDING)
+
+    @property
     def origin(self) -> str:
         """An addition to what is said of where a scene came from."""
         stand_in = f", stand-in for {self.stand_in_for}, not its data" if self.stand_in_for else ""

@@ -24,8 +24,8 @@ class FeatureSettings:
 
 @dataclass(frozen=True)
 class CaptureSettings:
-    """Size, samples and side files of a synthetic capture; the defaults are what the shipped captures were made with,
-    which hold the truth of the test views only.
+    """Size, samples and side files of a synthetic capture. The shipped captures have the default size and hold the
+    truth of the test views only; their samples are in their ``synthetic.json``.
 
     Raises:
         RtgsError: a value outside its range.

@@ -61,7 +61,7 @@ def load_mitsuba(variant: str | None = None) -> Any:
     try:
         import mitsuba
     except ImportError as error:
-        raise RtgsError("path tracing needs Mitsuba 3: pip install 'rtgs[synthetic]'") from error
+        raise RtgsError("path tracing needs Mitsuba 3: pip install -e '.[synthetic]' in the clone of rtgs") from error
     try:
         mitsuba.set_variant(chosen)
     except ImportError as error:

@@ -19,21 +19,28 @@ def look_at(position: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def cameras(viewpoints: Viewpoints, width: int, height: int, seed: int = 0) -> list[Camera]:
-    """Jittered cameras on ``rings`` (or arcs of them) of increasing elevation; name order is order in space."""
+    """Jittered cameras on ``rings`` (or arcs of them) of increasing elevation; name order is order in space.
+
+    Those with the wide lens (:meth:`Viewpoints.is_wide`) stand where they would without, but at the elevation of their
+    own. The others do not depend on whether there are any.
+    """
     rng = np.random.default_rng(seed)
     target = np.asarray(viewpoints.target, float)
-    focal = float(0.5 * width / np.tan(np.radians(viewpoints.field_of_view) / 2))
     made = []
     for index in range(viewpoints.count):
         turn, ring = divmod(index * viewpoints.rings, viewpoints.count)
         share = (ring / viewpoints.count) if viewpoints.rings > 1 else index / viewpoints.count
-        elevation = np.radians(np.interp(turn, (0, max(viewpoints.rings - 1, 1)), viewpoints.elevation))
+        wide = viewpoints.is_wide(index)
+        heights = viewpoints.wide_elevation if wide else viewpoints.elevation
+        elevation = np.radians(np.interp(turn, (0, max(viewpoints.rings - 1, 1)), heights))
         azimuth = np.radians(viewpoints.start) + rng.normal(0, 0.03)
         azimuth += np.radians(viewpoints.arc) * (share + turn / (2 * viewpoints.rings) * (viewpoints.arc >= 360))
         radius = rng.uniform(*viewpoints.radius)
         offset = np.array((np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)))
         jitter = viewpoints.jitter * viewpoints.radius[0] * rng.normal(0, 0.5, 3)
         rotation, translation = look_at(target + radius * offset, target + jitter)
+        angle = viewpoints.wide_field_of_view if wide else viewpoints.field_of_view
+        focal = float(0.5 * width / np.tan(np.radians(angle) / 2))
         made.append(
             Camera(
                 torch.from_numpy(rotation), torch.from_numpy(translation), focal, focal, width / 2, height / 2,

@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks.common import trace_scene, training_runs
 from benchmarks.common.machine import thread_cpu_seconds
-from benchmarks.speed import gaussians, losses, raster, raster_ellipsoids, speed_error, trace
+from benchmarks.speed import gaussians, light, losses, raster, raster_ellipsoids, speed_error, trace
 from rtgs.native import core
 
 
@@ -109,3 +109,15 @@ def test_speed_error_shrinks_the_schedule() -> None:
 
 def test_speed_error_sweep_has_each_point_once() -> None:
     assert sorted(speed_error.sweep([500, 1000], [5, 10])) == [(500, 10), (1000, 5), (1000, 10)]
+
+
+def test_light(run, monkeypatch: pytest.MonkeyPatch) -> None:
+    tiny = light.figures((8, 6), (16, 8, 4, 4), 8, calls=1)
+    monkeypatch.setattr(light, "figures", lambda: tiny | {f"lookup_128_{kind}": 1.0 for kind in ("ms", "torch_ms")})
+    figures = run(light)
+    parts = (*light.STEP, "step", "lookup_8")
+    assert all(figures[f"{name}_{kind}"] > 0 for name in parts for kind in ("ms", "torch_ms", "ratio"))
+    assert figures["step_ms"] == pytest.approx(sum(figures[f"{name}_ms"] for name in light.STEP), abs=0.01)
+    assert figures["isa"] == core.isa()
+    native, twin = (getattr(light.parts((8, 6), (16, 8, 4, 4), 8)["prefilter"], kind)() for kind in ("native", "twin"))
+    assert (native[6 * 16**2 :] - twin[6 * 16**2 :]).abs().max() < 1e-5, "both are the same filter"

@@ -9,7 +9,7 @@ from contextlib import nullcontext
 
 import pytest
 
-from benchmarks.speed import plan, tracking
+from benchmarks.speed import many_jobs, plan, tracking
 
 
 def last_line(module, monkeypatch, capsys, *words: str) -> dict:
@@ -25,6 +25,13 @@ def test_plan(monkeypatch, capsys):
     assert figures["steps"] == 2 * (1 + 3 * 4)  # the import is shared by three seeds
     assert figures["jobs"] == 6
     assert all(figures[key] >= 0 for key in ("warm_s", "one_key_changed_s", "cold_s", "graphs_s", "find_s"))
+
+
+def test_many_jobs_on_one_store_run_each_step_once(monkeypatch, capsys):
+    figures = last_line(many_jobs, monkeypatch, capsys, "--jobs", "12", "--processes", "2", "--workers", "1")
+    assert (figures["jobs"], figures["steps"]) == (12, 2 + 3 * 12)
+    assert (figures["made_twice"], figures["removed"]) == (0, 2)
+    assert min(figures[key] for key in ("lock_us", "processes_s", "engine_s")) > 0
 
 
 def test_tracking(monkeypatch, capsys, tmp_path):

@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 from pipelines.cli.main import main
-from pipelines.cli.show import _moved, _read_transform
+from pipelines.cli.show import _moved, read_transform
 from rtgs.config import compose
 from rtgs.core.cameras import Camera
 from rtgs.gaussians.ellipsoids import Ellipsoids
@@ -56,6 +56,14 @@ def test_frames_and_a_page(splat, tmp_path, capsys):
     assert "<title>model.ply</title>" in page
 
 
+def test_a_file_without_gaussians_is_refused(splat, tmp_path, capsys):
+    _, found = splat
+    empty = tmp_path / "empty.ply"
+    write_ply(empty, found.like({name: values[:0] for name, values in found.items()}))
+    assert main(["show", str(empty)]) == 1
+    assert "empty.ply holds 0 Gaussians" in capsys.readouterr().err
+
+
 def test_a_capture_measures_it(splat, tmp_path, demo, capsys):
     path, found = splat
     out = tmp_path / "out"
@@ -85,7 +93,7 @@ def test_a_model_in_nerfstudios_frame_is_seen_alike(tmp_path, splat, demo):
     moved = found.detached()
     moved.means = (scale * (found.means.double() @ rotation.T + offset)).float()
     moved.log_scales += math.log(scale)
-    transform = _read_transform(tmp_path / "dataparser_transforms.json")
+    transform = read_transform(tmp_path / "dataparser_transforms.json")
     assert transform is not None
     camera = demo.test[0].camera
     expected = render_splats(found, camera, near=0.02)
@@ -93,12 +101,12 @@ def test_a_model_in_nerfstudios_frame_is_seen_alike(tmp_path, splat, demo):
     assert float((seen - expected).abs().mean()) < 1e-3
     (tmp_path / "other.json").write_text('{"transform": [[1, 0, 0, 0], [0, 2, 0, 0], [0, 0, 1, 0]], "scale": 1}')
     with pytest.raises(ValueError, match="transform must be 3x4 with a rotation"):
-        _read_transform(tmp_path / "other.json")
+        read_transform(tmp_path / "other.json")
     for scale in ("NaN", "1e999", "0"):
         eye = "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]"
         (tmp_path / "other.json").write_text(f'{{"transform": {eye}, "scale": {scale}}}')
         with pytest.raises(ValueError, match="scale positive"):
-            _read_transform(tmp_path / "other.json")
+            read_transform(tmp_path / "other.json")
 
 
 @pytest.mark.parametrize(

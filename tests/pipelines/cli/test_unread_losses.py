@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from pipelines.cli.main import main
+from rtgs.config.names import overridden
 from tests.pipelines.app_cases import QUICK, _in_root, capture, root  # noqa: F401  (fixtures)
 
 TOLD = "method.loss.perceptual=0.02 has no effect: 2dgs has no such loss"
@@ -23,7 +24,8 @@ def test_a_plan_tells(words: list[str], capsys: pytest.CaptureFixture[str]):
     assert main(["plan", *words, "method.loss.perceptual=0.02"]) == 0
     assert capsys.readouterr().out.splitlines()[-2:] == [TOLD, "5 steps, 0 from the cache"]
     assert main(["plan", "--multirun", *words, "method.loss.perceptual=0.02,0.0"]) == 0
-    assert f"\n{TOLD} (tiny_room-2dgs-smoke)\n" in capsys.readouterr().out
+    named = overridden([*QUICK, "method.loss.perceptual=0.02"])
+    assert f"\n{TOLD} (tiny_room-2dgs-smoke-{named})\n" in capsys.readouterr().out
     assert main(["plan", *words]) == 0
     assert "has no effect" not in capsys.readouterr().out
 

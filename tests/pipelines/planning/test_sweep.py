@@ -20,6 +20,7 @@ from pipelines.cli import hydra_run
 from pipelines.cli.app import Membership
 from pipelines.cli.main import main
 from pipelines.planning.sweep import Sweep, SweepTask
+from rtgs.config.names import overridden
 from rtgs.core.errors import RtgsError
 from rtgs.workflow import StepOutcome, Store, SweepOutcomes
 
@@ -36,6 +37,7 @@ QUICK = (
     "hydra.launcher.workers=2",
     "hydra.launcher.threads=1",
 )
+NAMED = f"-{overridden(QUICK)}"
 
 
 @pytest.fixture(scope="module")
@@ -95,12 +97,14 @@ def test_a_sweep_is_one_plan_and_every_job_has_its_results(capture, tmp_path, ca
     assert counts == {"import_scene": 1, "train_diffuse": 4, "report": 4}
     assert "4 jobs, 17 steps, 0 from the cache" in captured.err
     assert "Start Nanny" not in captured.err  # nor anything else that Dask has to say while all is well
-    assert sorted(path.name for path in (tmp_path / "runs").glob("row*")) == [
-        "row-2dgs-smoke",
-        "row-2dgs-smoke-no_normal_loss",
-        "row-2dgs-smoke-no_normal_loss-seed1",
-        "row-2dgs-smoke-seed1",
-    ]
+    assert sorted(path.name for path in (tmp_path / "runs").glob("row*")) == sorted(
+        [
+            f"row-2dgs-smoke{NAMED}",
+            f"row-2dgs-smoke-no_normal_loss{NAMED}",
+            f"row-2dgs-smoke-no_normal_loss-seed1{NAMED}",
+            f"row-2dgs-smoke-seed1{NAMED}",
+        ]
+    )
     assert ["scene", "method"] in [line.split()[:2] for line in captured.out.splitlines()]
     table = (tmp_path / "tables" / "mine-smoke" / "table.md").read_text()
     assert "over 2 seeds" in table
@@ -156,7 +160,7 @@ def test_a_failing_job_leaves_the_others_alone_and_says_why(capture, tmp_path, c
     assert "1 of 2 jobs failed" in captured.out
     assert "job 0 (" in captured.out
     assert "schedule.densify_every is 0" in captured.out
-    assert (tmp_path / "runs" / "row-2dgs-smoke" / "report.html").is_file()
+    assert (tmp_path / "runs" / f"row-2dgs-smoke{NAMED}" / "report.html").is_file()
 
 
 def test_a_job_that_does_not_compose_leaves_the_others_alone(capture, tmp_path, capsys):
@@ -164,7 +168,7 @@ def test_a_job_that_does_not_compose_leaves_the_others_alone(capture, tmp_path, 
     assert main([*words, "scene=capture", f"scene.path={capture},/no/such/folder"]) == 1
     captured = capsys.readouterr()
     assert "capture folder /no/such/folder does not exist" in captured.out
-    assert (tmp_path / "runs" / "row-2dgs-smoke" / "report.html").is_file()
+    assert (tmp_path / "runs" / f"row-2dgs-smoke{NAMED}" / "report.html").is_file()
 
 
 def test_a_stock_launcher_with_its_own_processes_ends_the_same_way(capture, tmp_path, capsys):
@@ -176,7 +180,7 @@ def test_a_stock_launcher_with_its_own_processes_ends_the_same_way(capture, tmp_
     assert "2 of 3 jobs failed" in captured.out
     for value in (0, -1):  # each job's own error; the launcher brings only the first
         assert f"schedule.densify_every is {value}" in captured.out
-    assert (tmp_path / "runs" / "row-2dgs-smoke" / "report.html").is_file()
+    assert (tmp_path / "runs" / f"row-2dgs-smoke{NAMED}" / "report.html").is_file()
     assert "2dgs" in (tmp_path / "tables" / "mine-smoke" / "table.md").read_text()
 
 
@@ -185,7 +189,7 @@ def test_errors_that_another_sweep_left_in_the_folder_are_not_told(tmp_path):
     for left in ("old", "new"):
         sweep = Sweep.of(OmegaConf.create(hydra))
         assert sweep.elsewhere
-        sweep.forget_errors()
+        sweep.begin()
         assert sweep.error_of(0) == ""
         sweep.leave_error(0, RuntimeError(left))
         assert Sweep.of(OmegaConf.create(hydra)).error_of(0) == left  # a job finds the same sweep in its own process
@@ -256,3 +260,10 @@ def test_mistakes_stop_before_any_work(capture, tmp_path, override, expected, ca
     assert expected in captured.err
     assert "jobs failed" not in captured.out  # none of them was started
     assert not list(Store(tmp_path / "store").artifacts("train_diffuse"))
+
+
+def test_needs_of_a_step_that_there_is_not_stop_the_sweep(capture, capsys):
+    assert main(["run", "--multirun", f"scene={capture}", *QUICK, "hydra.launcher.step_limit=[sfn:1]"]) == 1
+    error = capsys.readouterr().err
+    assert "the needs of a step 'sfn' are given; the steps are" in error
+    assert "Traceback" not in error

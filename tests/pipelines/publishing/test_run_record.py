@@ -6,9 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.publishing.results import find_run
-from pipelines.publishing.run_record import RunRecord
 from rtgs.core.errors import RtgsError
+from rtgs.runs.record import RunRecord, find_run
 
 
 def test_the_latest_run_is_found_and_a_damaged_record_is_named(tmp_path: Path) -> None:

@@ -13,10 +13,7 @@ import torch
 from PIL import Image
 
 from pipelines.cli.main import main
-from pipelines.steps import judge
-from pipelines.steps.judge import PLAIN
-from pipelines.steps.training import OBJECT_FOLDER, load_method
-from pipelines.steps.views import read_render
+from rtgs.config.names import overridden
 from rtgs.core.cameras import Camera
 from rtgs.core.names import plain_stem
 from rtgs.evaluate.images import to_bytes
@@ -24,6 +21,10 @@ from rtgs.evaluate.judgement import JudgeRecord
 from rtgs.evaluate.metrics import psnr
 from rtgs.evaluate.regions import Regions
 from rtgs.mesh.container import read_object_mesh
+from rtgs.runs import mixture
+from rtgs.runs.mixture import PLAIN
+from rtgs.runs.training import OBJECT_FOLDER, load_method
+from rtgs.runs.views import read_render
 from rtgs.scenes.canonical import read_scene
 from rtgs.scenes.scene import Scene
 from rtgs.train.method import Mode
@@ -164,12 +165,14 @@ def test_a_sweep_merges_judged_jobs_and_the_plain_method_is_not_judged(capture, 
     told = capsys.readouterr()
     assert "2 jobs, 12 steps, " in told.err
     assert "no judge step: 3dgs is the plain method itself" in told.err
-    assert JudgeRecord.read(root / "runs" / "tiny_room-2dgs-smoke-judged").full == "2dgs"
-    assert not (root / "runs" / "tiny_room-3dgs-smoke" / "judge.json").exists()
+    named = overridden([*QUICK, "schedule.total=8"])
+    assert JudgeRecord.read(root / "runs" / f"tiny_room-2dgs-smoke-judged-{named}").full == "2dgs"
+    assert (root / "runs" / f"tiny_room-3dgs-smoke-{named}").is_dir()
+    assert not (root / "runs" / f"tiny_room-3dgs-smoke-{named}" / "judge.json").exists()
     assert main(["plan", "--multirun", *words]) == 0
     assert "12 steps, 12 from the cache, nothing to do" in capsys.readouterr().out
 
 
 def test_runs_without_a_judge_render_as_ever(tmp_path):
     scene = Scene("none", (), (), torch.zeros(4, 3), torch.zeros(4, 3), 1.0, "test")
-    assert judge.read_mixture({"train_diffuse": tmp_path}, scene) is None
+    assert mixture.read_mixture({"train_diffuse": tmp_path}, scene) is None

@@ -6,8 +6,9 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from pipelines.steps import render, report, views
+from pipelines.steps import render, report
 from rtgs.core.errors import RtgsError
+from rtgs.runs import views
 
 
 def rendered_view(folder: Path, layers: bool) -> dict[str, torch.Tensor]:

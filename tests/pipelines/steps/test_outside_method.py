@@ -13,11 +13,11 @@ from safetensors.torch import load_file
 
 from pipelines.cli.main import main
 from pipelines.planning.graph import build_graph
-from pipelines.steps.training import stage_params
 from rtgs.config import compose
 from rtgs.core.errors import RtgsError
 from rtgs.methods import create_method, find_method, method_names
 from rtgs.methods.settings import MethodSettings
+from rtgs.runs.training import stage_params
 from rtgs.train.guard import TrainingDiverged
 from rtgs.train.method import Stage
 from rtgs.train.parameters import ParameterGroup
@@ -149,7 +149,7 @@ def test_a_bad_gradient_of_its_group_stops_training_and_is_named(on_path):
     [
         ("nowhere:SPEC", "names nowhere:SPEC, which does not import"),
         ("exposure_method:build", "is a function, not a rtgs.methods.MethodSpec"),
-        ("2dgz", "choose one of 2dgs, 3dgs, envgs, rtgs.*did you mean 2dgs"),
+        ("2dgz", "choose one of 2dgs, 3dgs, 3dgs_dr, gaussian_shader, .*did you mean 2dgs"),
     ],
 )
 def test_what_is_no_method_is_refused(on_path, name: str, message: str):
@@ -161,4 +161,4 @@ def test_an_entry_point_gives_it_a_plain_name(on_path, monkeypatch: pytest.Monke
     declared = metadata.EntryPoint("exposure", NAME, "rtgs.methods")
     monkeypatch.setattr(metadata, "entry_points", lambda group: [declared] if group == "rtgs.methods" else [])
     assert find_method("exposure").name == "exposure"
-    assert method_names() == ("2dgs", "3dgs", "envgs", "rtgs", "rtgs_printed", "exposure")
+    assert method_names()[-2:] == ("rtgs_printed", "exposure")

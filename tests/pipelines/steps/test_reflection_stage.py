@@ -10,10 +10,11 @@ import pytest
 
 from pipelines.cli.main import main
 from pipelines.planning.graph import build_graph
-from pipelines.steps.training import stage_params
 from rtgs.config import compose
+from rtgs.config.names import overridden
 from rtgs.gaussians.materials import has_materials
 from rtgs.gaussians.ply import read_ply
+from rtgs.runs.training import stage_params
 from rtgs.scenes import canonical
 from tests.pipelines.app_cases import QUICK, _in_root, capture, root  # noqa: F401  (fixtures)
 
@@ -59,7 +60,7 @@ def test_both_stages_run_and_leave_two_sets_and_layers(root: Path, capture: Path
     assert len(reflection) > 0
     summary = json.loads((found[0] / "summary.json").read_text())
     assert summary["steps"] == 12
-    run = root / "runs" / f"tiny_room-{name}-smoke"
+    run = root / "runs" / f"tiny_room-{name}-smoke-{overridden([*QUICK, *SECOND])}"
     page = (run / "report.html").read_text()
     layers = ("Diffuse", "Reflection", "Normal", "Specular k_s", "Roughness", "f0", "Final")
     assert all(f"Enlarge {layer}, rendered" in page for layer in layers)
@@ -81,7 +82,8 @@ def test_the_split_sum_figure_shares_the_first_stage_and_shows_the_layers_of_bot
     assert weights == [("microfacet", 0.0), ("microfacet", 1.0), ("microfacet", 16.0), ("split_sum", 1.0)]
     pictures = []
     rows = ("gain_unbounded", "none", "gain_16", "split_sum")
-    for run in (f"tiny_room-rtgs-smoke{'' if row == 'none' else f'-{row}'}" for row in rows):
+    named = overridden([*QUICK, *SECOND])
+    for run in (f"tiny_room-rtgs-smoke{'' if row == 'none' else f'-{row}'}-{named}" for row in rows):
         page = (root / "runs" / run / "report.html").read_text(encoding="utf-8")
         assert all(f"Enlarge {layer}, rendered" in page for layer in ("Diffuse", "Reflection", "Roughness"))
         pictures.append(json.loads((root / "runs" / run / "metrics.json").read_text())["mean"]["psnr"])

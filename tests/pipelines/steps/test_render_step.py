@@ -10,12 +10,15 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from pipelines.steps import render
-from pipelines.steps.views import read_coverage, read_render
+from pipelines.steps import render, report
 from rtgs.core.cameras import Camera
+from rtgs.light.cubemap import CubemapLight
+from rtgs.light.pictures import CUBE, PANORAMA, RADIANCE
+from rtgs.light.settings import CubemapSettings
 from rtgs.methods import Mode, RenderedView, RenderOptions
 from rtgs.methods.parts.part import Frame, Raster
 from rtgs.render.buffers import RasterBuffers
+from rtgs.runs.views import read_coverage, read_render
 from rtgs.scenes.canonical import save_scene
 from rtgs.scenes.scene import Scene, View
 from rtgs.track.null import NullTracker
@@ -33,6 +36,7 @@ class CountingMethod:
     asked: list[tuple[str, RenderOptions]] = field(default_factory=list)
     base_depth: float = 2.0  # of the base set; what is shown lies at 2
     base_alpha: float = 1.0
+    light: CubemapLight | None = None
 
     @property
     def base(self) -> CountingMethod:
@@ -48,9 +52,14 @@ class CountingMethod:
         self, camera: Camera, step: int, mode: Mode, options: RenderOptions, mask: torch.Tensor | None
     ) -> RenderedView:
         assert step == 100
-        self.asked.append((camera.name, options))
-        image = torch.full((3, HEIGHT, WIDTH), 0.75 if options.masks else 0.25)
-        empty = torch.zeros(HEIGHT, WIDTH)
+        if camera.name == render.WARM_UP:
+            assert max(camera.width, camera.height) <= 16
+        else:
+            self.asked.append((camera.name, options))
+        assert mask is None or mask.shape == (camera.height, camera.width)
+        image = torch.full((3, camera.height, camera.width), 0.75 if options.masks else 0.25)
+        image[:, ::2] += 0.1 if camera.height > HEIGHT else 0.0  # what a finer picture shows besides
+        empty = torch.zeros(camera.height, camera.width)
         buffers = RasterBuffers(image, empty + 1, empty + 2 if options.depth else None, None)
         transparent = mask if self.glass else None
         maps = {} if transparent is None else {"transparent": transparent}
@@ -76,10 +85,17 @@ def context(tmp_path: Path) -> StepContext:
     return StepContext(inputs, tmp_path / "out", tmp_path / "partial", logging.getLogger("test"), NullTracker())
 
 
-def run(context: StepContext, method: CountingMethod, monkeypatch: pytest.MonkeyPatch, *, maps: bool) -> None:
+def run(
+    context: StepContext,
+    method: CountingMethod,
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    maps: bool,
+    params: render.RenderParams | None = None,
+) -> None:
     monkeypatch.setattr(render, "last_training", lambda inputs: inputs["train_diffuse"])
     monkeypatch.setattr(render, "load_method", lambda folder, scene: (method, SimpleNamespace(until=100)))
-    render.render(render.RenderParams(maps=maps), context)
+    render.render(params or render.RenderParams(maps=maps), context)
 
 
 @pytest.mark.parametrize(
@@ -100,6 +116,49 @@ def test_training_views_that_show_a_pixel_are_counted(context, monkeypatch, chan
 def test_without_maps_nothing_is_counted(context, monkeypatch) -> None:
     run(context, CountingMethod(glass=False), monkeypatch, maps=False)
     assert read_coverage(context.out, "0.png") is None
+
+
+def test_the_image_from_the_refined_pose_is_kept_beside_that_of_the_test(context, monkeypatch) -> None:
+    found = []
+
+    def refined(method: object, view: View, step: int, *, steps: int) -> Camera:
+        found.append((view.name, step, steps))
+        return replace(view.camera, name=f"refined {view.name}")
+
+    monkeypatch.setattr("rtgs.methods.refine_pose.refine_pose", refined)
+    method = CountingMethod(glass=False)
+    monkeypatch.setattr(render, "last_training", lambda inputs: inputs["train_diffuse"])
+    monkeypatch.setattr(render, "load_method", lambda folder, scene: (method, SimpleNamespace(until=100)))
+    render.render(render.RenderParams(maps=False, refine_steps=7), context)
+    assert found == [("0.png", 100, 7), ("1.png", 100, 7)]
+    assert [name for name, _ in method.asked] == ["0.png", "refined 0.png", "1.png", "refined 1.png"]
+    timed = render.read_timed(context.out, render.RenderTimes.read(context.out), "1.png")
+    assert timed.refined is not None
+    assert torch.equal(timed.refined, timed.image)  # of this method, which shows every camera the same
+
+
+@pytest.mark.parametrize("judged", [True, False])
+@pytest.mark.parametrize("times", [1, 2])
+def test_the_image_from_the_refined_pose_is_made_as_the_other_is(context, monkeypatch, judged, times) -> None:
+    """As fine, and with what the judge replaced: only their poses tell the two apart."""
+
+    class Judge:
+        def of(self, camera: Camera, image: torch.Tensor) -> torch.Tensor:
+            return (image - (0.25 if camera.name.startswith("refined") else 0.125)).clamp_min(0)
+
+    def refined(method: object, view: View, step: int, *, steps: int) -> Camera:
+        return replace(view.camera, name=f"refined {view.name}")
+
+    monkeypatch.setattr("rtgs.methods.refine_pose.refine_pose", refined)
+    monkeypatch.setattr(render, "read_mixture", lambda inputs, scene: Judge() if judged else None)
+    params = render.RenderParams(maps=False, supersample=times, refine_steps=7, preview=0)
+    run(context, CountingMethod(glass=False), monkeypatch, maps=False, params=params)
+    timed = render.read_timed(context.out, render.RenderTimes.read(context.out), "1.png")
+    assert timed.refined is not None
+    base = 0.25 if times == 1 else 0.3
+    shown = (base - 0.125, 0.0 if times == 1 else 0.05) if judged else (base, base)
+    for image, value in zip((timed.image, timed.refined), shown):
+        torch.testing.assert_close(image.mean(), torch.tensor(value))
 
 
 @pytest.mark.parametrize("maps", [True, False])
@@ -127,6 +186,25 @@ def test_without_transparent_objects_given_masks_are_not_rendered(context, monke
     assert torch.equal(timed.image, read_render(context.out, "1.png")["image"])
 
 
+def test_a_far_light_is_written_the_right_way_up_and_other_methods_write_none(context, monkeypatch) -> None:
+    """The training camera looks along z with y down: a light from -y is at the top of the panorama."""
+    run(context, CountingMethod(glass=False), monkeypatch, maps=False)
+    assert not (context.out / render.ENVIRONMENT).exists()
+    assert report._environment(context.out / render.ENVIRONMENT) is None
+    texels = torch.zeros(6, 4, 4, 3)
+    texels[3] = 1.0  # the face of -y
+    again = replace(context, out=context.out.with_name("again"))
+    again.out.mkdir()
+    light = CubemapLight(texels, CubemapSettings(side=4, activation="identity"))
+    run(again, CountingMethod(glass=False, light=light), monkeypatch, maps=False)
+    assert {path.name for path in (again.out / render.ENVIRONMENT).iterdir()} == {PANORAMA, RADIANCE, CUBE}
+    panorama = report._environment(again.out / render.ENVIRONMENT)
+    assert panorama is not None
+    assert panorama.shape == (256, 512, 3)
+    assert (panorama[:32] == 255).all()
+    assert (panorama[128:] == 0).all()
+
+
 @dataclass
 class NamedMethod(CountingMethod):
     """Shows a grey that depends on the view."""
@@ -135,7 +213,7 @@ class NamedMethod(CountingMethod):
         self, camera: Camera, step: int, mode: Mode, options: RenderOptions, mask: torch.Tensor | None
     ) -> RenderedView:
         shown = super().render(camera, step, mode, options, mask)
-        return replace(shown, image=torch.full((3, HEIGHT, WIDTH), SHADES[camera.name]))
+        return replace(shown, image=torch.full((3, HEIGHT, WIDTH), SHADES.get(camera.name, 0.0)))
 
 
 SHADES = {"s/t.jpg": 0.25, "s_t.jpg": 0.5, "a.jpg": 0.75, "a.png": 1.0}
@@ -149,3 +227,16 @@ def test_views_whose_stems_meet_keep_their_own_pictures(context, monkeypatch) ->
     for name, shade in SHADES.items():
         assert read_render(context.out, name)["image"].unique().tolist() == [shade]
     assert len(list((context.out / "images").glob("*.png"))) == 4
+
+
+def test_finer_images_are_averaged_and_maps_are_not(context, monkeypatch) -> None:
+    method = CountingMethod(glass=True)
+    params = render.RenderParams(supersample=2)
+    run(context, method, monkeypatch, maps=True, params=params)
+    for name, keys in (("0.png", ("image", render.GIVEN)), ("1.png", ("image",))):
+        kept = read_render(context.out, name)
+        for key, value in zip(keys, (0.3, 0.8), strict=False):
+            torch.testing.assert_close(kept[key], torch.full((3, HEIGHT, WIDTH), value))
+        assert kept["depth"].shape == (HEIGHT, WIDTH)
+    masked, bare = (sum(asked == name for asked, _ in method.asked) for name in ("0.png", "1.png"))
+    assert (masked, bare) == (3, 2), "maps at the size of the photo, and each image once, finer"

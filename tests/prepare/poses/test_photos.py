@@ -109,7 +109,7 @@ def test_heic_without_the_package_is_a_message(tmp_path, monkeypatch):
     found = read_photo_set(tmp_path)
     assert found.names == ("a.jpg",)
     assert "1 of 2 photos cannot be read" in found.findings[0].message
-    assert "pip install 'rtgs[prepare]'" in found.findings[0].message
+    assert "pip install -e '.[prepare]'" in found.findings[0].message
 
 
 def test_broken_photos_are_left_out_and_named(tmp_path):

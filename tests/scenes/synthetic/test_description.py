@@ -100,6 +100,9 @@ BALL = 'title = "x"\n[[shape]]\nname = "a"\nkind = "sphere"\n'
         (BALL + "[viewpoints]\ncount = 0\n", r"scene.toml, viewpoints: count = 0 must be more than 0"),
         (BALL + "[viewpoints]\nfield_of_view = 180.0\n", r"field_of_view = 180 must be below 180"),
         (BALL + "[viewpoints]\nelevation = [10.0, 90.0]\n", r"elevation = 90 must be below 90"),
+        (BALL + "[viewpoints]\nwide_every = 1\n", r"wide_every = 1 must be 0 .no wide lens. or 2 to 10000"),
+        (BALL + "[viewpoints]\nwide_field_of_view = 180.0\n", r"wide_field_of_view = 180 must be below 180"),
+        (BALL + "[viewpoints]\nwide_elevation = [-90.0, 9.0]\n", r"wide_elevation = 90 must be below 90"),
     ],
 )
 def test_what_does_not_describe_a_scene_is_refused_with_its_place(text, message, tmp_path):

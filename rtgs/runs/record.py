@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from rtgs.core.errors import RtgsError
 from rtgs.core.records import read_record, write_json
 
 RUN_FILE = "run.json"
@@ -45,3 +46,20 @@ class RunRecord:
         """
         path = folder / RUN_FILE
         return read_record(RunRecord, path, _REMEDY) if path.is_file() else None
+
+
+def find_run(runs: Path, name: str | None) -> Path:
+    """The folder of the named run, or of the one that finished last.
+
+    Raises:
+        RtgsError: there is none, or its record is damaged.
+    """
+    if name is None:
+        found = {folder.name: record for folder in sorted(runs.glob("*")) if (record := RunRecord.read(folder))}
+        if not found:
+            raise RtgsError(f"no finished run in {runs}; start one with `rtgs run`")
+        return runs / max(found, key=lambda each: found[each].finished)
+    if RunRecord.read(runs / name) is None:
+        listed = ", ".join(path.parent.name for path in sorted(runs.glob(f"*/{RUN_FILE}"))) or "none"
+        raise RtgsError(f"no finished run {name!r} in {runs}; there is {listed}")
+    return runs / name

@@ -10,7 +10,9 @@ from rtgs.core.names import stored_file
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from rtgs.core.cameras import Camera
     from rtgs.methods import RenderedView
+    from rtgs.methods.model import Model
 
 COVERAGE = "coverage.safetensors"
 
@@ -26,6 +28,19 @@ def view_maps(rendered: RenderedView) -> dict[str, Tensor]:
     if rendered.layers is not None:
         maps |= {name: tensor.float() for name, tensor in rendered.layers.items()}
     return {name: tensor.contiguous() for name, tensor in maps.items() if tensor is not None}
+
+
+def seen_maps(method: Model, camera: Camera, step: int, mask: Tensor | None = None) -> dict[str, Tensor]:
+    """The image (3, H, W), the maps and layers of :func:`view_maps` and the weights of the layers from any camera, as
+    of ``step``; a transparent object is where ``mask`` (H, W) says, without one where its mesh is seen."""
+    import torch
+
+    from rtgs.methods import Mode, RenderOptions
+
+    options = RenderOptions(depth=True, normal="normal" in method.maps, layers=True, weights=True)
+    with torch.no_grad():
+        rendered = method.render(camera, step, Mode.EVALUATE, options, mask)
+    return {"image": rendered.image, **view_maps(rendered)}
 
 
 def read_coverage(folder: Path, view_name: str) -> Tensor | None:

@@ -1,0 +1,112 @@
+"""``rtgs explain``: what a key means, its value, its default, and who set it."""
+
+from __future__ import annotations
+
+import inspect
+import textwrap
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from rtgs.config import RunConfig, compose
+from rtgs.config.explain import close_keys
+from rtgs.config.keys import Key, config_keys, own_keys, sentence_of, words_of_value
+from rtgs.config.locate import project_root
+from rtgs.config.provenance import Setting, settings_of
+from rtgs.config.words import friendly_overrides
+from rtgs.core.credentials import redact
+from rtgs.core.errors import RtgsError
+from rtgs.core.listing import columns
+from rtgs.methods import find_method
+
+HELP = """rtgs explain [KEY ...] [words of a run]
+
+  rtgs explain schedule.total                 what it means, its value and default, where it is set
+  rtgs explain schedule.total preset=paper    the same in the run of these words
+  rtgs explain method.loss                    every key below it, with its value
+  rtgs explain                                all keys"""
+_WIDTH = 100
+
+
+def explain(words: Sequence[str]) -> int:
+    """The command; returns the exit code.
+
+    Raises:
+        RtgsError: no such key.
+        hydra.errors.HydraException: the words do not compose.
+    """
+    if words[:1] in (["-h"], ["--help"]):
+        print(HELP)
+        return 0
+    asked = [word for word in words if "=" not in word]
+    overrides = friendly_overrides([word for word in words if "=" in word])
+    config, _ = compose(overrides)
+    names = asked or [""]
+    texts, keys = [], keys_of(config)
+    for name in names:
+        key = keys.get(name)
+        texts.append(_listed(name, config) if key is None else one_key(key, config, overrides))
+    print("\n\n".join(texts))
+    return 0
+
+
+def keys_of(config: RunConfig) -> dict[str, Key]:
+    """Every key of a run: those of all runs, and in the place of ``method.own`` those of its method's own settings."""
+    own = own_keys(_own(config))
+    return {name: key for name, key in config_keys().items() if not own or name != "method.own"} | own
+
+
+def _own(config: RunConfig) -> Any:
+    return find_method(config.method.name).own_settings(config.method)
+
+
+def one_key(key: Key, config: RunConfig, words: Sequence[str]) -> str:
+    """All that is known of a key in the run of these words."""
+    rows = [("value", redact(str(value_of(config, key.name))))]
+    settings = settings_of(key.name, words)
+    if settings:
+        rows.append(("set in", settings[-1].place if len(settings) == 1 else _chain(settings)))
+    else:
+        rows.append(("set in", "nowhere: the default"))
+    source = Path(inspect.getfile(key.owner)).resolve()
+    if source.is_relative_to(project_root()):  # not of a method from outside
+        source = source.relative_to(project_root())
+    rows.append(("default", f"{key.default}  ({key.owner.__name__}, {source})"))
+    if choices := words_of_value(key):
+        rows.append(("choices", ", ".join(choices)))
+    rows.append(("means", sentence_of(key)))
+    lines = [key.name]
+    for title, text in rows:
+        lines += textwrap.wrap(text, _WIDTH, initial_indent=f"  {title:<9}", subsequent_indent=" " * 11)
+    return "\n".join(lines)
+
+
+def _chain(settings: Sequence[Setting]) -> str:
+    """The last place, and what it went over."""
+    *before, last = settings
+    return f"{last.place} (before it {', '.join(f'{each.place}: {redact(each.text)}' for each in reversed(before))})"
+
+
+def _listed(name: str, config: RunConfig) -> str:
+    """Every key below a dotted name, with its value."""
+    below = [key for key in keys_of(config) if not name or key.startswith(f"{name}.")]
+    if not below:
+        close = close_keys(name.rpartition(".")[2])
+        advice = f"did you mean {' or '.join(close)}?" if close else "`rtgs explain` lists all keys"
+        raise RtgsError(f"rtgs explain: there is no key {name!r}; {advice}")
+    return columns([("key", "value"), *((key, _brief(value_of(config, key))) for key in below)])
+
+
+def _brief(value: object) -> str:
+    text = redact(str(value))
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def value_of(config: RunConfig, name: str) -> object:
+    """The value at a dotted name."""
+    value: object = config
+    if name.startswith("method.own."):
+        value, name = _own(config), name.removeprefix("method.own.")
+    for part in name.split("."):
+        value = getattr(value, part)
+    return value

@@ -1,0 +1,1 @@
+"""Public captures, brought by name: what there is, from where, under which licence. Nothing is trained here."""

@@ -1,0 +1,114 @@
+"""A directional light as a picture: all directions by longitude and latitude, and a cubemap in the layout of OpenGL.
+
+The world of a capture has no axis that is always up, so a picture is made with the ``up`` and the ``ahead`` that it
+is given.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from rtgs.core.errors import RtgsError
+from rtgs.light.cubemap import DirectionalLight
+from rtgs.optics.light import decoded
+
+PANORAMA, RADIANCE, CUBE = "environment.png", "environment.hdr", "environment_cube.npy"
+
+# Faces of OpenGL (its specification, table of cube map faces): middle, and where columns and rows grow to.
+_GL_FACES = (
+    ((1, 0, 0), (0, 0, -1), (0, -1, 0)),
+    ((-1, 0, 0), (0, 0, 1), (0, -1, 0)),
+    ((0, 1, 0), (1, 0, 0), (0, 0, 1)),
+    ((0, -1, 0), (1, 0, 0), (0, 0, -1)),
+    ((0, 0, 1), (1, 0, 0), (0, -1, 0)),
+    ((0, 0, -1), (-1, 0, 0), (0, -1, 0)),
+)
+
+
+def upright(up: np.ndarray, ahead: np.ndarray) -> np.ndarray:
+    """(3, 3) rows: right, up and backward as unit vectors of the world, with ``up`` kept and ``ahead`` in its plane.
+
+    Raises:
+        ValueError: one of them is 0.
+    """
+    length = np.linalg.norm(up)
+    if length == 0 or np.linalg.norm(ahead) == 0:
+        raise ValueError(f"up {up} and ahead {ahead} must not be 0")
+    up = up / length
+    forward = ahead - (ahead @ up) * up
+    if np.linalg.norm(forward) < 1e-6 * np.linalg.norm(ahead):  # ahead is up: any direction beside it
+        forward = np.eye(3)[np.abs(up).argmin()]
+        forward = forward - (forward @ up) * up
+    forward /= np.linalg.norm(forward)
+    return np.stack((np.cross(forward, up), up, -forward))
+
+
+def panorama_directions(height: int, frame: np.ndarray) -> np.ndarray:
+    """(height, 2 height, 3) unit world directions of a panorama's pixels.
+
+    Up is the first row, ahead the middle, right of ahead right of the middle, as one looks around from inside;
+    ``frame`` (3, 3) as :func:`upright` gives it.
+    """
+    latitude = np.pi * (0.5 - (np.arange(height) + 0.5) / height)
+    longitude = 2 * np.pi * ((np.arange(2 * height) + 0.5) / (2 * height) - 0.5)
+    flat = np.cos(latitude)[:, None]
+    local = np.stack(
+        (
+            flat * np.sin(longitude),
+            np.broadcast_to(np.sin(latitude)[:, None], (height, 2 * height)),
+            -flat * np.cos(longitude),
+        ),
+        axis=-1,
+    )
+    return local @ frame
+
+
+def face_directions(side: int, frame: np.ndarray) -> np.ndarray:
+    """(6, side, side, 3) unit world directions of OpenGL's faces +x -x +y -y +z -z: x right, y up, z backward."""
+    places = (2 * np.arange(side) + 1) / side - 1
+    faces = []
+    for axis, column, row in np.array(_GL_FACES, dtype=float):
+        faces.append(axis + places[None, :, None] * column + places[:, None, None] * row)
+    local = np.stack(faces)
+    return local / np.linalg.norm(local, axis=-1, keepdims=True) @ frame
+
+
+@torch.no_grad()
+def light_picture(light: DirectionalLight, directions: np.ndarray, roughness: float = 0.0) -> np.ndarray:
+    """(..., 3) float32 colours of a light along directions (..., 3)."""
+    flat = torch.from_numpy(np.ascontiguousarray(directions, dtype=np.float32)).reshape(-1, 3)
+    found = light(flat, torch.full((len(flat),), roughness))
+    return found.numpy().reshape(directions.shape)
+
+
+def save_environment(folder: Path, light: DirectionalLight, frame: np.ndarray, side: int) -> tuple[Path, ...]:
+    """Write a light whose colours are encoded as sRGB: as it is seen, and as linear light for programs that render.
+
+    Files: ``environment.png`` (panorama, 2 side high), ``environment.hdr`` (the same, linear, Radiance RGBE) and
+    ``environment_cube.npy`` (6, side, side, 3) float32, encoded, the faces of :func:`face_directions`.
+
+    Raises:
+        RtgsError: a picture cannot be written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    panorama = light_picture(light, panorama_directions(2 * side, frame))
+    linear = decoded(torch.from_numpy(panorama), "linear").numpy()
+    bytes_ = np.round(255 * panorama.clip(0, 1)).astype(np.uint8)
+    paths = tuple(folder / name for name in (PANORAMA, RADIANCE, CUBE))
+    for path, picture in zip(paths[:2], (bytes_, linear)):
+        if not cv2.imwrite(str(path), np.ascontiguousarray(picture[..., ::-1])):
+            raise RtgsError(f"{path}: the picture of the environment cannot be written; is there space left?")
+    np.save(paths[2], light_picture(light, face_directions(side, frame)))
+    return paths
+
+
+def mean_frame(rotations: Tensor) -> np.ndarray:
+    """:func:`upright` of cameras (N, 3, 3), world to camera with x right and y down: mean up, where the first looks."""
+    rows = rotations.double().numpy()
+    up = -rows[:, 1].mean(0)
+    return upright(up if np.linalg.norm(up) > 1e-3 else -rows[0, 1], rows[0, 2])

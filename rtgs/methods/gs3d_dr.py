@@ -1,0 +1,97 @@
+"""3DGS-DR (Ye et al., SIGGRAPH 2024; docs/3dgs_dr.md): ellipsoids, deferred shading, one cubemap.
+
+Its numbers are in conf/method/3dgs_dr.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Literal
+
+from rtgs.core.refuse import refuse_bad_numbers, refuse_outside, refuse_unknown_words, refuse_unless
+from rtgs.methods.family import cubemap_stages, guided
+from rtgs.methods.spec import HARMONICS, MethodSpec
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from rtgs.methods.model import Model
+    from rtgs.methods.parts.base import BaseSet
+    from rtgs.methods.spec import Setup
+    from rtgs.train.terms import LossTerm
+
+
+@dataclass(frozen=True)
+class DeferredSettings:
+    """The keys ``method.own.<name>``."""
+
+    primitive: Literal["ellipsoids", "surfels"] = "ellipsoids"  # published: ellipsoids
+    weight_floor: float = 0.001  # m is raised to it at resets of opacities
+    # A sphere in the world frame, outside of which nothing is to reflect: published for each real scene, by hand.
+    scope_radius: float = 0.0  # 0: none
+    scope_center: tuple[float, ...] = (0.0, 0.0, 0.0)
+    outside: float = 0.4  # weight of the mean m of all Gaussians outside it
+
+    def __post_init__(self) -> None:
+        refuse_unknown_words(self, "method.own")
+        refuse_bad_numbers(self, "method.own")
+        refuse_outside(self, "method.own", 0, 1, "weight_floor", open_low=True)
+        refuse_unless(self.weight_floor < 1, "method.own.weight_floor", self.weight_floor, "below 1")
+        legal = len(self.scope_center) == 3 and all(math.isfinite(value) for value in self.scope_center)
+        refuse_unless(legal, "method.own.scope_center", list(self.scope_center), "three numbers")
+
+
+def build(setup: Setup) -> Model:
+    """A base set with a weight, and a cubemap that its mirror directions meet.
+
+    Raises:
+        ValueError: a loss is on that needs a surface, with ellipsoids.
+    """
+    from rtgs.methods.losses import mcmc_terms, refuse_surface_losses, surface_terms
+    from rtgs.methods.model import Model
+    from rtgs.methods.parts.base import BaseSet
+    from rtgs.methods.parts.cubemap_mirror import CubemapMirror
+    from rtgs.methods.parts.kinds import ELLIPSOIDS, SURFELS
+
+    own: DeferredSettings = setup.own
+    setup = replace(setup, settings=guided(setup.settings))
+    surfels = own.primitive == "surfels"
+    if not surfels:  # their normals are composited, but no depth goes with them
+        refuse_surface_losses(setup.settings, ("normal", "distortion"))
+    base = BaseSet(setup, SURFELS if surfels else ELLIPSOIDS)
+    mirror = CubemapMirror(setup, base, own.weight_floor)
+    terms = (*surface_terms(setup), *mcmc_terms(base, setup), *scope_terms(base, own))
+    return Model(setup, (base, mirror), terms)
+
+
+def scope_terms(base: BaseSet, own: DeferredSettings) -> Sequence[LossTerm]:
+    """The mean m of the Gaussians whose centres are outside the scope, where there is one."""
+    import torch
+
+    from rtgs.methods.parts.cubemap_mirror import WEIGHT
+    from rtgs.train.terms import LossTerm
+
+    if own.scope_radius == 0 or own.outside == 0:
+        return ()
+    center = torch.tensor(own.scope_center)
+
+    def outside(rendered: object, view: object) -> Tensor | None:
+        gaussians = base.set.gaussians
+        if WEIGHT not in gaussians:
+            return None
+        far = (gaussians.means.detach() - center).square().sum(1) > own.scope_radius**2
+        return gaussians.activated(WEIGHT)[far].mean() if bool(far.any()) else None
+
+    return (LossTerm("outside", own.outside, outside),)
+
+
+# Without MIRROR: what ablations take away there is the traced set.
+SPEC = MethodSpec(
+    "3dgs_dr",
+    cubemap_stages("primitive"),
+    build,
+    frozenset({HARMONICS}),
+    own=DeferredSettings,
+)

@@ -1,0 +1,76 @@
+"""Small motions of the training cameras, learned with the scene (docs/photos.md; gsplat's pose optimisation)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from rtgs.core.decisions import Decision
+from rtgs.methods.parts.exposure import rows_by_name
+from rtgs.methods.parts.part import Frame, Part
+from rtgs.render.pose import NUMBERS, moved, rotation_of
+from rtgs.train.method import RenderedView
+from rtgs.train.parameters import ParameterGroup, Rate
+from rtgs.train.terms import LossTerm
+
+if TYPE_CHECKING:
+    from rtgs.methods.spec import Setup
+    from rtgs.scenes.scene import View
+
+LIMITS = (-0.3, 0.3)  # of all numbers: beyond it poses are to be searched for anew, and within it rows stay apart
+
+
+class Poses(Part):
+    """A translation and a rotation for each training view; other cameras stay."""
+
+    name = "poses"
+
+    def __init__(self, setup: Setup) -> None:
+        """Raises RtgsError where views cannot be told apart by their names."""
+        settings = setup.settings.poses
+        self.rows = rows_by_name(setup.scene, "method.poses.enabled")
+        self.extent = setup.scene.extent
+        self.decay = settings.decay
+        rate = Rate(settings.rate, settings.rate_end, max(setup.schedule.total, 1))
+        self.group = ParameterGroup(self.name, {"deltas": torch.zeros(len(self.rows), NUMBERS)}, rate, limits=LIMITS)
+
+    @property
+    def groups(self) -> tuple[ParameterGroup, ...]:
+        return (self.group,)
+
+    @property
+    def decisions(self) -> tuple[Decision, ...]:
+        deltas = self.group["deltas"].detach()
+        found = ""
+        if bool(deltas.any()):
+            shift = self.extent * float(torch.linalg.vector_norm(deltas[:, :3], dim=1).mean())
+            found = f", moved by {shift:.3g} world units and {_degrees(deltas):.2g} degrees on average"
+        why = f"method.poses.enabled, {len(self.rows)} cameras{found}; test cameras stay"
+        return (Decision("poses of the training cameras learned", why),)
+
+    def aim(self, frame: Frame) -> Frame:
+        """From the camera as it is moved by now, with its graph where there is one to be."""
+        row = self.rows.get(frame.camera.name)
+        if row is None:
+            return frame
+        pose = moved(frame.camera, self.group["deltas"][row], self.extent)
+        return replace(frame, camera=pose.of(frame.camera), pose=pose if pose.rotation.requires_grad else None)
+
+    def terms(self) -> Iterator[LossTerm]:
+        """Half the squares, whose gradient is Adam's weight decay."""
+
+        def squares(rendered: RenderedView, view: View) -> Tensor:
+            return 0.5 * self.group["deltas"].square().sum()
+
+        if self.decay > 0:
+            yield LossTerm("pose_decay", self.decay, squares)
+
+
+def _degrees(deltas: Tensor) -> float:
+    """Mean angle of the rotations."""
+    traces = torch.stack([rotation_of(delta[3:].double()).trace() for delta in deltas])
+    return float(((traces - 1) / 2).clamp(-1, 1).acos().mean().rad2deg())

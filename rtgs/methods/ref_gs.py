@@ -1,0 +1,104 @@
+"""Ref-GS (Zhang et al., CVPR 2025; docs/ref_gs.md): surfels, a map of features by direction, a small network.
+
+Its numbers are in conf/method/ref_gs.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from rtgs.core.refuse import refuse_bad_counts, refuse_outside, refuse_unless
+from rtgs.methods.family import cubemap_stages, guided
+from rtgs.methods.spec import HARMONICS, SURFACE, MethodSpec
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from rtgs.methods.model import Model
+    from rtgs.methods.parts.base import BaseSet
+    from rtgs.methods.spec import Setup
+    from rtgs.scenes.scene import View
+    from rtgs.train.method import RenderedView
+    from rtgs.train.terms import LossTerm
+
+
+@dataclass(frozen=True)
+class FeatureSettings:
+    """The keys ``method.own.<name>``. Defaults are those of the published code for real scenes."""
+
+    width: int = 0  # of the network's hidden layers; 0: half of environment.side, 256 of 512
+    network_rate: float = 5e-4
+    albedo: float = -2.0  # log of five albedos at the start
+    albedo_gain: float = 0.25  # of its rate, times that of sh_dc: 0.0005 of 0.002; other scenes 0.001
+    # Standard deviation of the raw features at the start. 0 is published: their first gradient is then 1e12 times too
+    # large, which Adam does not forget, and they stand still.
+    feature_noise: float = 0.01
+    opacity_entropy: float = 1e-3  # weight
+    # A sphere in the world frame, outside of which SH colours stand: published for each real scene, by hand.
+    scope_radius: float = 0.0  # 0: none, everything is inside
+    scope_center: tuple[float, ...] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        refuse_bad_counts(self, "method.own")
+        refuse_unless(self.width <= 1024, "method.own.width", self.width, "at most 1024")
+        refuse_outside(self, "method.own", 0, math.inf, "network_rate", "albedo_gain", open_low=True)
+        refuse_outside(self, "method.own", 0, math.inf, "feature_noise", "opacity_entropy", "scope_radius")
+        refuse_unless(-12 < self.albedo < 5, "method.own.albedo", self.albedo, "between -12 and 5")
+        legal = len(self.scope_center) == 3 and all(math.isfinite(value) for value in self.scope_center)
+        refuse_unless(legal, "method.own.scope_center", list(self.scope_center), "three numbers")
+
+
+def build(setup: Setup) -> Model:
+    """Surfels with materials and features, and the light that they mirror.
+
+    Raises:
+        RtgsError: the map's side is no power of 2.
+    """
+    from rtgs.methods.losses import mcmc_terms, surface_terms
+    from rtgs.methods.model import Model
+    from rtgs.methods.parts.base import BaseSet
+    from rtgs.methods.parts.feature_mirror import FeatureMirror
+    from rtgs.methods.parts.kinds import SURFELS
+
+    own: FeatureSettings = setup.own
+    side = setup.settings.environment.side
+    refuse_unless(side >= 4 and side & (side - 1) == 0, "method.environment.side", side, "a power of 2, 4 or more")
+    setup = replace(setup, settings=guided(setup.settings))
+    base = BaseSet(setup, SURFELS)
+    mirror = FeatureMirror(setup, base, own)
+    terms = (*surface_terms(setup), *mcmc_terms(base, setup), *feature_terms(base, own, setup))
+    return Model(setup, (base, mirror), terms)
+
+
+def feature_terms(base: BaseSet, own: FeatureSettings, setup: Setup) -> Sequence[LossTerm]:
+    """Opacities near 0 or 1, and where there is a sphere the SH colours outside of it."""
+    from rtgs.methods.parts.feature_mirror import OUTSIDE, SH_IMAGE
+    from rtgs.methods.plans import reflection_plan
+    from rtgs.train.coverage_losses import opacity_entropy
+    from rtgs.train.losses import photometric_loss
+    from rtgs.train.terms import LossTerm
+
+    loss = setup.settings.loss
+    start = reflection_plan(setup.settings.reflection, setup.schedule).start
+
+    def entropy(rendered: RenderedView, view: View) -> Tensor:
+        return opacity_entropy(base.set.gaussians.opacity_logits.sigmoid())
+
+    def outside(rendered: RenderedView, view: View) -> Tensor | None:
+        weight = rendered.maps.get(OUTSIDE)
+        if weight is None:
+            return None
+        shown = rendered.maps[SH_IMAGE] * weight
+        return photometric_loss(shown, view.image * weight, loss.l1, loss.dssim).total
+
+    terms = (
+        ("opacity_entropy", own.opacity_entropy, entropy),
+        ("outside", float(own.scope_radius > 0), outside),
+    )
+    return [LossTerm(name, weight, value, start) for name, weight, value in terms if weight > 0]
+
+
+SPEC = MethodSpec("ref_gs", cubemap_stages(), build, frozenset({HARMONICS, SURFACE}), own=FeatureSettings)

@@ -1,0 +1,156 @@
+"""Exposure and tint of each training photo: found again where they are known, unseen by test views."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from photo_cases import photographed, plain, steady, trained
+from safetensors.torch import load_file
+from training_cases import small_scene, small_trainer
+
+from rtgs.core.errors import RtgsError
+from rtgs.evaluate.metrics import cc_psnr
+from rtgs.gaussians.ply import write_ply
+from rtgs.methods import Mode
+from rtgs.methods.parts.exposure import exposed, rows_by_name
+from rtgs.methods.photo_settings import AppearanceSettings
+from rtgs.scenes.scene import Scene
+from rtgs.train.checkpoint import checkpoint_path
+from rtgs.train.guard import TrainingDiverged
+
+FAST = AppearanceSettings(enabled=True, rate=0.05, rate_end=5e-4)
+TOTAL = 300
+
+
+def exposed_scene(scene: Scene) -> tuple[Scene, torch.Tensor]:
+    """The training photos at other exposures, and the stops."""
+    stops = torch.linspace(-0.4, 0.4, len(scene.train))
+    stops = stops[torch.randperm(len(stops), generator=torch.Generator().manual_seed(0))]
+    views = (replace(view, image=view.image * 2**each) for view, each in zip(scene.train, stops, strict=True))
+    return replace(scene, train=tuple(views)), stops
+
+
+def test_known_exposures_are_found_again_and_the_test_view_gains():
+    scene, stops = exposed_scene(photographed("3dgs"))
+    _, without = trained(scene, plain("3dgs"), TOTAL)
+    trainer, summary = trained(scene, replace(plain("3dgs"), appearance=FAST), TOTAL)
+    (group,) = trainer.method.groups
+    assert float((group["stops"].detach() - stops).abs().max()) < 0.05  # type: ignore[index]
+    assert summary.psnr_test is not None
+    assert without.psnr_test is not None
+    assert summary.psnr_test > without.psnr_test + 0.8
+    assert any("stops" in decision.why for decision in summary.decisions)
+
+
+def test_brightness_is_that_of_the_stops_alone():
+    grey, generator = torch.full((3, 4, 5), 0.4), torch.Generator().manual_seed(2)
+    colors = 0.2 * torch.randn(3, 3, generator=generator)
+    assert torch.equal(exposed(grey, torch.zeros(()), torch.zeros(3, 3)), grey)
+    brighter = exposed(grey, torch.tensor(0.5), colors)
+    assert float(brighter.mean()) == pytest.approx(0.4 * 2**0.5, rel=1e-6)
+    assert float(brighter.std(0).mean()) > 0.01
+
+
+def test_views_that_it_was_not_trained_on_are_shown_without():
+    scene, _ = exposed_scene(photographed("2dgs", views=5))
+    trainer, _ = trained(scene, replace(plain("2dgs"), appearance=FAST), 60)
+    first = scene.train[0].camera
+    stranger = replace(first, name="nobody")
+    shown, bare = (trainer.method.render(camera, 60, Mode.EVALUATE).image for camera in (first, stranger))
+    group = trainer.method.groups[0]
+    torch.testing.assert_close(shown, exposed(bare, group["stops"][0], group["colors"][0]))  # type: ignore[index]
+    assert not torch.allclose(shown, bare, atol=1e-3)
+
+
+def test_the_means_over_the_photos_are_held():
+    """Photos that are all brighter are a brighter scene, and no exposures."""
+    scene = photographed("3dgs", views=6)
+    brighter = replace(scene, train=tuple(replace(view, image=view.image * 1.3) for view in scene.train))
+    means = {}
+    for weight in (0.0, 1.0):
+        settings = replace(FAST, mean_exposure=weight, mean_color=weight)
+        trainer, _ = trained(brighter, replace(plain("3dgs"), appearance=settings), 150)
+        means[weight] = abs(float(trainer.method.groups[0]["stops"].detach().mean()))  # type: ignore[index]
+    assert means[1.0] < 0.02
+    assert means[0.0] > 3 * means[1.0]
+
+
+@pytest.mark.parametrize("what", ["appearance", "poses"])
+def test_a_run_that_stops_goes_on_bit_for_bit(tmp_path: Path, what: str):
+    from rtgs.methods.photo_settings import PoseSettings
+
+    scene, _ = exposed_scene(photographed("2dgs", views=5))
+    learned = FAST if what == "appearance" else PoseSettings(enabled=True, rate=1e-3, rate_end=1e-5)
+    settings = replace(plain("2dgs"), **{what: learned})
+    straight, halted = tmp_path / "straight", tmp_path / "halted"
+    small_trainer(scene, settings, steady(40), checkpoint_dir=straight).run()
+    trainer = small_trainer(scene, settings, steady(40), checkpoint_dir=halted)
+    after_step = trainer.method.after_step
+
+    def interrupted(step: int, observations):
+        if step == 36:
+            raise KeyboardInterrupt
+        return after_step(step, observations)
+
+    trainer.method.after_step = interrupted  # type: ignore[method-assign]
+    with pytest.raises(KeyboardInterrupt):
+        trainer.run()
+    assert small_trainer(scene, settings, steady(40), checkpoint_dir=halted).run().resumed_from == 30
+    one, other = (load_file(checkpoint_path(folder, 40) / "state.safetensors") for folder in (straight, halted))
+    key = "method.exposure.values.stops" if what == "appearance" else "method.poses.values.deltas"
+    assert bool(one[key].any())
+    assert one.keys() == other.keys()
+    assert [name for name in one if not torch.equal(one[name], other[name])] == []
+
+
+def test_the_published_model_holds_the_gaussians_alone(tmp_path: Path):
+    scene, _ = exposed_scene(photographed("2dgs", views=5))
+    trainer, _ = trained(scene, replace(plain("2dgs"), appearance=FAST), 30)
+    bare, _ = trained(scene, plain("2dgs"), 30)
+    headers = []
+    for number, each in enumerate((trainer, bare)):
+        (part,) = each.method.sets
+        path = tmp_path / f"{number}.ply"
+        write_ply(path, part.gaussians)  # type: ignore[attr-defined]
+        headers.append(path.read_bytes().split(b"end_header")[0])
+    assert headers[0] == headers[1]
+
+
+def test_a_number_that_is_not_one_stops_the_training_and_is_named():
+    scene = photographed("2dgs", views=5)
+    trainer = small_trainer(scene, replace(plain("2dgs"), appearance=FAST), steady(20))
+    with torch.no_grad():
+        trainer.method.groups[0]["stops"][2] = torch.nan  # type: ignore[index]
+    with pytest.raises(TrainingDiverged, match=r"set exposure, stops: 1 rows not finite \(row 2"):
+        trainer.run()
+
+
+def test_photos_that_cannot_be_told_apart_are_refused():
+    with pytest.raises(RtgsError, match=r"method\.appearance\.enabled learns something of each photo"):
+        small_trainer(small_scene(), replace(plain("2dgs"), appearance=FAST))  # cameras without names
+    scene = photographed("2dgs", views=4)
+    clash = replace(scene, test=(replace(scene.test[0], camera=scene.train[0].camera),))
+    with pytest.raises(RtgsError, match="not all their own"):
+        rows_by_name(clash, "key")
+
+
+def test_switched_off_nothing_is_there():
+    trainer = small_trainer(small_scene(), plain("2dgs"))
+    assert trainer.method.groups == ()
+    assert set(trainer.method.parts) == {"base"}
+
+
+def test_a_colour_fit_undoes_gain_and_offset_of_each_channel():
+    generator = torch.Generator().manual_seed(3)
+    photo = 0.2 + 0.5 * torch.rand(3, 12, 16, generator=generator)
+    gain, offset = torch.tensor([0.8, 1.1, 1.2]), torch.tensor([0.1, -0.05, 0.02])
+    render = gain[:, None, None] * photo + offset[:, None, None]
+    assert cc_psnr(render, photo) > 90
+    assert cc_psnr(photo, photo) == pytest.approx(100)
+    flat = torch.full_like(photo, 0.5)
+    assert cc_psnr(flat, photo) == pytest.approx(
+        -10 * float(torch.log10((photo.mean((1, 2), keepdim=True) - photo).square().mean())), abs=1.0
+    )  # nothing to fit: the render stays, up to its mean

@@ -1,0 +1,146 @@
+"""How many threads the core takes: what is refused, and what a forked child gets."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from rtgs.native import core
+from tests.render.native_scene import native_scene
+from tests.render.native_trace_scene import native_trace_scene
+
+
+def _floats(*shape: int) -> np.ndarray:
+    return np.full(shape, 0.5, np.float32)
+
+
+def _raster(threads: int) -> None:
+    scene = native_scene(count=3, width=16, height=16, channels=3)
+    rotation, translation = scene.camera.rotation.numpy(), scene.camera.translation.numpy()
+    camera = core.RasterCamera(rotation, translation, 10, 10, 8, 8, 16, 16, 0.2, 100)
+    core.Rasterization(camera, False, False).project(*(tensor.numpy() for tensor in scene.tensors), threads)
+
+
+def _ellipsoids(threads: int) -> None:
+    scene = native_scene(count=3, width=16, height=16, channels=3)
+    rotation, translation = scene.camera.rotation.numpy(), scene.camera.translation.numpy()
+    camera = core.RasterCamera(rotation, translation, 10, 10, 8, 8, 16, 16, 0.2, 100)
+    arrays = [tensor.numpy() for tensor in scene.tensors]
+    arrays[3] = _floats(3, 3)
+    core.EllipsoidRasterization(camera, 0.3, 3.0, False, False).project(*arrays, threads)
+
+
+def _tree(method: str, threads: int) -> None:
+    arrays = [tensor.numpy() for tensor in native_trace_scene(count=20, rays=1).all()[:5]]
+    tree = core.SurfelTree()
+    tree.build(*arrays, 1 / 255, threads if method == "build" else 1)
+    tree.refit(*arrays, 1 / 255, threads)
+
+
+def _activate(threads: int) -> None:
+    raw = (_floats(2, 3), _floats(2, 2), _floats(2, 4), _floats(2), _floats(2, 3), _floats(2, 15, 3))
+    out = (_floats(2, 3), _floats(2, 3), _floats(2, 2), _floats(2), _floats(2, 3))
+    core.activate_gaussians(raw, (0.0, 0.0, 0.0), 0, out, None, threads)
+
+
+def _normal(threads: int) -> None:
+    maps = _floats(3, 8, 8), _floats(8, 8), _floats(8, 8)
+    core.normal_consistency_loss(*maps, True, np.eye(3, dtype=np.float32), _floats(4), 0.1, 1.0, *[None] * 3, threads)
+
+
+def _mirror(threads: int) -> None:
+    maps = _floats(4, 3), _floats(4), _floats(4, 3)
+    core.mirror_rays(*maps, (0.0, 0.0, 0.0), 1e-6, False, _floats(4, 3), _floats(4, 3), _floats(4), threads)
+
+
+def _filter(threads: int) -> None:
+    rows, numbers = np.zeros(1, np.int32), (_floats(1), np.zeros(8, np.int32), _floats(1), _floats(1))
+    maps = _floats(1, 3), _floats(1, 32), _floats(1, 3)
+    core.cube_filter(rows, np.array([0, 1], np.int64), rows, *numbers, *maps, threads)
+
+
+CALLS = {
+    "rasterise surfels": _raster,
+    "rasterise ellipsoids": _ellipsoids,
+    "build a tree": lambda threads: _tree("build", threads),
+    "refit a tree": lambda threads: _tree("refit", threads),
+    "trace": lambda threads: core.Tracing(1e-4, 1 / 255, 0, False, False, "given", threads),
+    "activate": _activate,
+    "adam": lambda threads: core.adam_step(
+        [(*(_floats(4, 2) for _ in range(4)), 2, 0.1)], 0.9, 0.99, 1e-8, 1.0, threads
+    ),
+    "count": lambda threads: core.count_nonfinite(_floats(4), threads),
+    "photometric": lambda threads: core.photometric_loss(
+        _floats(3, 8, 8), _floats(3, 8, 8), 1.0, 1.0, True, None, None, threads
+    ),
+    "normal consistency": _normal,
+    "mono normal": lambda threads: core.mono_normal_loss(
+        _floats(3, 8, 8), _floats(3, 8, 8), None, np.eye(3, dtype=np.float32), 1.0, None, threads
+    ),
+    "mirror rays": _mirror,
+    "microfacet": lambda threads: core.microfacet_reflection(
+        _floats(4), _floats(4), _floats(4), 1e-3, 1e-3, 1.0, _floats(4), threads
+    ),
+    "decode": lambda threads: core.srgb_decode(_floats(4), _floats(4), threads),
+    "encode": lambda threads: core.srgb_encode(_floats(4), _floats(4), threads),
+    "cube lookup": lambda threads: core.cube_lookup(
+        _floats(6 * 16, 4), np.array([2], np.int32), _floats(4, 3), _floats(0), _floats(4, 3), threads
+    ),
+    "cube filter": _filter,
+}
+
+
+@pytest.mark.parametrize("call", CALLS.values(), ids=CALLS.keys())
+def test_every_entry_refuses_numbers_of_threads_that_are_none(call):
+    for threads in (0, -1, -(2**31), 1025, 100_000):
+        with pytest.raises(ValueError, match=rf"threads={threads} must be 1 to 1024"):
+            call(threads)
+    call(1)
+    call(3)
+
+
+def test_percentiles_on_no_grid_are_refused():
+    with pytest.raises(ValueError, match="step=0 must be at least 1"):
+        core.depth_percentiles(_floats(8, 8), None, 0.5, 0)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
+def test_a_child_forked_after_threads_were_used_renders_the_same_bits():
+    done = subprocess.run([sys.executable, "-c", _FORKS], capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == 0, (done.returncode, done.stderr[-2000:])
+    parent, child, raw = done.stdout.split()
+    assert parent == child
+    assert raw == "0"
+
+
+# A child that waits for threads which only its parent has would wait for ever: the alarm ends it.
+_FORKS = """
+import hashlib, os, signal, sys
+import torch
+from rtgs.native import core
+from tests.render.native_scene import SCENE_OPTIONS, native_scene
+from tests.render.native_trace_scene import everything, native_trace_scene
+
+def digest():
+    scene = native_scene(count=400, width=97, height=64, channels=3)
+    leaves = scene.leaves()
+    pixels = scene.render(SCENE_OPTIONS, leaves).features
+    found = [pixels.detach(), *torch.autograd.grad(pixels.square().sum(), leaves)]
+    found += everything(native_trace_scene(count=300, rays=500))
+    large = torch.ones(400, 400)
+    found.append((large @ large).exp().sum())  # torch's own threads
+    return hashlib.sha256(b"".join(each.detach().numpy().tobytes() for each in found)).hexdigest()
+
+torch.set_num_threads(2)
+print(digest(), flush=True)
+child = os.fork()
+if child == 0:
+    signal.alarm(120)
+    print(digest(), flush=True)
+    print(core.count_nonfinite(torch.zeros(1 << 20).numpy(), 2), flush=True)  # whatever number is asked for
+    os._exit(0)
+_, status = os.waitpid(child, 0)
+sys.exit(os.waitstatus_to_exitcode(status))
+"""

@@ -1,0 +1,189 @@
+"""``rtgs explain``, and what is said of words that are not understood."""
+
+from __future__ import annotations
+
+import pytest
+
+from pipelines.cli.explain import keys_of, one_key
+from pipelines.cli.main import main
+from rtgs.config import compose
+from rtgs.config.explain import close_keys
+from rtgs.config.keys import config_keys, sentence_of
+from rtgs.config.locate import project_root
+from rtgs.config.provenance import Setting, settings_of
+
+UNDESCRIBED = {
+    "AppearanceSettings": "enabled",
+    "DensitySettings": "max_surfels min_opacity reset_opacity split_count too_large_shrink too_large_split_count",
+    "DetectorSettings": "short_side",
+    "EvaluationSettings": "refine_steps",
+    "FeatureSettings": "max_features",
+    "InitSettings": "neighbors opacity sh_degree",
+    "MappingSettings": "init_min_inliers refine_principal_point",
+    "MaterialSettings": "f0",
+    "MatteSettings": "share",
+    "McmcSettings": "init_scale min_opacity noise_border noise_sharpness scale_loss",
+    "MethodSettings": "name",
+    "NormalAdapter": "box mean multiple size",
+    "OptimizerSettings": "beta1 beta2 decay_to eps f0_logits log_scales opacity_logits quaternions roughness_logits "
+    "sh_dc sh_rest",
+    "PaneSettings": "min_views",
+    "PoseSettings": "enabled",
+    "ReflectionSettings": "alpha_cutoff background densify_every per_cell transmittance_cutoff",
+    "RenderSettings": "background",
+    "ScheduleSettings": "coarse_until",
+    "SegmenterSettings": "encoder",
+    "SfmSettings": "min_photos seed",
+    "TableConfig": "title",
+    "TrackingConfig": "kind",
+    "TransmittanceSettings": "alpha_cutoff densify_every densify_from per_cell rim transmittance_cutoff",
+}
+"""Fields whose own name says it, by dataclass: of these alone `rtgs explain` tells what the dataclass is about."""
+
+
+def explained(key: str, *words: str) -> dict[str, str]:
+    config, _ = compose(words)
+    text = one_key(keys_of(config)[key], config, words)
+    rows: dict[str, str] = {}
+    for line in text.splitlines()[1:]:
+        title, said = line[:11].strip(), line[11:]
+        name = title or list(rows)[-1]
+        rows[name] = f"{rows.get(name, '')} {said}".strip()
+    return rows
+
+
+def test_a_key_is_told_with_value_default_place_and_sentence():
+    rows = explained("schedule.total")
+    assert rows["value"] == "2000"
+    assert rows["set in"] == "conf/preset/quick.yaml"
+    assert rows["default"] == "30000  (ScheduleSettings, rtgs/train/settings.py)"
+    assert rows["means"] == "steps of all stages together"
+    assert explained("schedule.total", "preset=smoke")["set in"].startswith("conf/preset/smoke.yaml")
+    over = explained("schedule.total", "schedule.total=77")
+    assert (over["value"], over["set in"]) == ("77", "command line (before it conf/preset/quick.yaml: 2000)")
+    assert explained("seed")["set in"] == "nowhere: the default"
+    assert explained("mesh.source")["choices"] == "auto, hull, tsdf, given"
+
+
+def test_passwords_are_not_told(monkeypatch, capsys):
+    uri = "http://me:hunter2's secret@127.0.0.1:9/" + 200 * "long"
+    monkeypatch.setenv("RTGS_TRACKING_URI", "")
+    monkeypatch.setenv("RTGS_REMOTE", uri)
+    assert main(["explain", "paths.remote", "tracking.uri", "tracking", f"tracking.uri={uri}"]) == 0
+    said = capsys.readouterr().out
+    assert said.count("http://***@127.0.0.1:9/long") == 3
+    assert "secret" not in said
+
+
+def test_places_come_in_the_order_in_which_they_count():
+    found = settings_of("scene.path", ["scene=fox", "scene.path=/my/photos"])
+    assert [each.place for each in found] == ["conf/scene/fox.yaml", "command line"]
+    assert found[-1] == Setting("command line", "/my/photos")
+
+
+def test_what_is_told_last_is_the_value_of_the_run():
+    words = ["preset=standard", "method=rtgs", "scene=toycar", "method.loss.normal=0.01"]
+    config, _ = compose(words)
+    for key in ("schedule.total", "scene.long_side", "method.density.max_surfels", "method.loss.normal"):
+        value: object = config
+        for part in key.split("."):
+            value = getattr(value, part)
+        assert settings_of(key, words)[-1].text == str(value), key
+
+
+def test_every_key_has_a_sentence():
+    for name, key in config_keys().items():
+        told = sentence_of(key)
+        assert told.strip(), name
+        if told.startswith(f"{key.field}, one of:"):
+            assert key.field in UNDESCRIBED.get(key.owner.__name__, "").split(), f"{name} has no comment"
+            assert len(told) > len(f"{key.field}, one of: "), f"{key.owner.__name__} has no docstring"
+
+
+def test_a_field_of_a_base_class_is_told_by_its_own_comment():
+    assert explained("method.environment.side")["means"].startswith("texels along an edge")
+
+
+def test_settings_that_one_method_has_are_keys_of_its_runs(capsys):
+    words = ("scene=demo", "method=3dgs_dr", "method.own.weight_floor=0.01")
+    rows = explained("method.own.weight_floor", *words)
+    assert (rows["value"], rows["set in"]) == ("0.01", "command line (before it conf/method/3dgs_dr.yaml: 0.001)")
+    assert rows["default"] == "0.001  (DeferredSettings, rtgs/methods/gs3d_dr.py)"
+    assert rows["means"] == "m is raised to it at resets of opacities"
+    assert explained("method.own.primitive", *words)["choices"] == "ellipsoids, surfels"
+    assert main(["explain", "method.own", *words]) == 0
+    lines = [line.split()[:2] for line in capsys.readouterr().out.splitlines()]
+    assert ["method.own.weight_floor", "0.01"] in lines
+    assert ["method.own.outside", "0.4"] in lines
+    assert all(line[0].startswith("method.own.") for line in lines[1:])
+    assert main(["explain", "method.own.weight_floor", "method=2dgs"]) == 1
+    assert "there is no key 'method.own.weight_floor'" in capsys.readouterr().err
+
+
+def test_settings_of_a_method_from_outside_are_keys_too(monkeypatch):
+    monkeypatch.syspath_prepend(str(project_root() / "examples" / "new_method"))
+    words = ("scene=demo", "method=2dgs", "method.name='exposure_method:SPEC'", "+method.own.rate=0.5")
+    rows = explained("method.own.rate", *words)
+    assert (rows["value"], rows["means"]) == ("0.5", "of Adam")
+
+
+def test_groups_of_keys_and_all_are_listed(capsys):
+    assert main(["explain", "method.loss", "method.loss.dssim=0.5"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert any(line.split() == ["method.loss.dssim", "0.5"] for line in lines)
+    assert all(line.startswith(("key", "method.loss.")) for line in lines)
+    assert main(["explain"]) == 0
+    assert len(capsys.readouterr().out.splitlines()) == len(config_keys()) + 1
+    assert main(["explain", "schedule.totl"]) == 1
+    assert "there is no key 'schedule.totl'; did you mean schedule.total" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("word", "key"),
+    [
+        ("iterations", "schedule.total"),
+        ("long_side", "scene.long_side"),
+        ("resolution", "scene.long_side"),
+        ("lambda_dssim", "method.loss.dssim"),
+        ("totl", "schedule.total"),
+        ("los", "method.loss"),
+        ("seedd", "seed"),
+    ],
+)
+def test_words_of_other_programs_and_slips_lead_to_the_key(word, key):
+    assert close_keys(word)[0] == key
+
+
+def test_every_key_that_is_advised_exists():
+    from rtgs.config.explain import _ELSEWHERE
+
+    launcher = {"hydra.launcher.workers"}
+    assert set(_ELSEWHERE.values()) - launcher <= set(config_keys())
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "expected"),
+    [
+        (["rnu"], 2, "unknown command 'rnu': did you mean `rtgs run`?"),
+        (["run", "iterations=100"], 1, "Did you mean schedule.total?"),
+        (["run", "/no/such/folder", "method=2dgs"], 1, "capture folder /no/such/folder does not exist"),
+        (["show", "--frames", "3"], 2, "the following arguments are required: file\n"),
+        (["cache"], 2, "the following arguments are required: action\n"),
+    ],
+)
+def test_mistakes_are_told_with_what_to_write(words, code, expected, capsys, monkeypatch, tmp_path):
+    monkeypatch.setenv("RTGS_ROOT", str(tmp_path))  # where Hydra puts its records
+    try:
+        found = main(words)
+    except SystemExit as stopped:
+        found = stopped.code
+    assert found == code
+    assert expected in capsys.readouterr().err
+
+
+def test_help_of_run_is_a_screen(capsys):
+    assert main(["run", "--help"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) <= 40
+    for text in ("method: 2dgs", "rtgs run /my/capture", "preset: ", "rtgs explain"):
+        assert any(text in line for line in lines)
