@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipelines.cli.threads import with_threads
-from rtgs.core.errors import RtgsError
+from pipelines.cli.words import THREADS, Reader, place, read_words, some_of, whole
 
 if TYPE_CHECKING:
     from pipelines.publishing.exported_run import ExportedRun
@@ -117,39 +116,16 @@ def parse_words(words: Sequence[str]) -> ExportWords:
     Raises:
         RtgsError: names the word and what may stand there.
     """
-    found: dict[str, object] = {}
-    for word in words:
-        key, equals, value = word.partition("=")
-        if word.startswith("-"):
-            raise RtgsError(f"rtgs export: {word} is no word of it; write key=value\n\n{HELP}")
-        if not equals:
-            if "run" in found:
-                raise RtgsError(f"rtgs export: {found['run']} and {word}: one run at a time")
-            found["run"] = word
-        elif key in found:
-            raise RtgsError(f"rtgs export: {key}= is given twice")
-        else:
-            found[key] = _value(key, value)
-    return ExportWords(**found)  # type: ignore[arg-type]
+    return ExportWords(
+        **read_words("rtgs export", words, _READERS, options="is no word of it: write key=value", help=HELP)
+    )
 
 
-def _value(key: str, value: str) -> object:
-    """Raises: RtgsError: no such key, or no such value."""
-    if key in ("steps", "splats", "threads"):
-        most = {"steps": MOST_STEPS, "splats": MOST_SPLATS, "threads": 1024}[key]
-        if not (value.isascii() and value.isdecimal()) or not 1 <= int(value[:12]) <= most:
-            raise RtgsError(f"rtgs export: {key}={value} must be a whole number from 1 to {most}")
-        return int(value)
-    if key == "format":
-        chosen = tuple(dict.fromkeys(value.split(",")))
-        if unknown := [each for each in chosen if each not in FORMATS]:
-            raise RtgsError(f"rtgs export: format={unknown[0]} is unknown: choose some of {', '.join(FORMATS)}")
-        return chosen
-    if key in ("out", "root"):
-        if not value:
-            raise RtgsError(f"rtgs export: {key}= needs a folder")
-        return Path(value).expanduser()
-    known = [item.name for item in fields(ExportWords) if item.name != "run"]
-    close = difflib.get_close_matches(key, known, n=1)
-    hint = f"did you mean {close[0]}=?" if close else f"there are {', '.join(known)}"
-    raise RtgsError(f"rtgs export: {key}= is no word of it; {hint}")
+_READERS: dict[str, Reader] = {
+    "format": some_of(FORMATS),
+    "steps": whole(1, MOST_STEPS),
+    "splats": whole(1, MOST_SPLATS),
+    "out": place,
+    "threads": THREADS,
+    "root": place,
+}

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipelines.cli.words import THREADS, Reader, place, read_words, some_of, whole
 from rtgs.core.errors import RtgsError
 
 if TYPE_CHECKING:
@@ -89,51 +89,29 @@ def parse_words(words: Sequence[str]) -> ShowWords:
     Raises:
         RtgsError: names the word and what may stand there.
     """
-    found: dict[str, object] = {}
-    for word in words:
-        key, equals, value = word.partition("=")
-        if word.startswith("-"):
-            raise RtgsError(f"rtgs show: options such as {word} are for FILE.ply; of a run write key=value\n\n{HELP}")
-        if not equals:
-            if "run" in found:
-                raise RtgsError(f"rtgs show: {found['run']} and {word}: one run at a time")
-            found["run"] = word
-        elif key in found:
-            raise RtgsError(f"rtgs show: {key}= is given twice")
-        else:
-            found[key] = _value(key, value)
-    return ShowWords(**found)  # type: ignore[arg-type]
-
-
-def _value(key: str, value: str) -> object:
-    """Raises: RtgsError: no such key, or no such value."""
-    if key in ("frames", "fps", "threads"):
-        most = {"frames": MOST_FRAMES, "fps": 240, "threads": 1024}[key]
-        if not value.isdecimal() or not 1 <= int(value[:9]) <= most:
-            raise RtgsError(f"rtgs show: {key}={value} must be a whole number from 1 to {most}")
-        return int(value)
-    if key == "size":
-        return _size(value)
-    if key == "format":
-        chosen = tuple(value.split(","))
-        if unknown := [each for each in chosen if each not in FORMATS]:
-            raise RtgsError(f"rtgs show: format={unknown[0]} is unknown: choose some of {', '.join(FORMATS)}")
-        return chosen
-    if key in ("transform", "out", "root"):
-        return Path(value).expanduser()
-    if key in ("path", "layer"):
-        return value
-    known = [item.name for item in fields(ShowWords) if item.name != "run"]
-    close = difflib.get_close_matches(key, known, n=1)
-    hint = f"did you mean {close[0]}=?" if close else f"there are {', '.join(known)}"
-    raise RtgsError(f"rtgs show: {key}= is no word of a run; {hint}")
+    options = "is for FILE.ply, as all options are: of a run write key=value"
+    return ShowWords(**read_words("rtgs show", words, _READERS, options=options, help=HELP))
 
 
 def _size(value: str) -> tuple[int, int]:
     width, _, height = value.lower().partition("x")
     if not (width.isdecimal() and height.isdecimal() and 8 <= int(width[:6]) <= 8192 and 8 <= int(height[:6]) <= 8192):
-        raise RtgsError(f"rtgs show: size={value} is no size such as 640x480 (8 to 8192 pixels)")
+        raise ValueError("is no size such as 640x480 (8 to 8192 pixels)")
     return int(width), int(height)
+
+
+_READERS: dict[str, Reader] = {
+    "path": str,
+    "layer": str,
+    "frames": whole(1, MOST_FRAMES),
+    "fps": whole(1, 240),
+    "size": _size,
+    "format": some_of(FORMATS),
+    "transform": place,
+    "out": place,
+    "threads": THREADS,
+    "root": place,
+}
 
 
 def _formats(asked: ShowWords) -> tuple[str, ...]:

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import difflib
 import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pipelines.cli.termination import Terminated
-from rtgs.core.errors import RtgsError
-from rtgs.view.settings import ViewerSettings
+from pipelines.cli.words import THREADS, Reader, place, read_words, whole
+from rtgs.view.settings import HIGHEST_PORT, LARGEST_SIDE, ViewerSettings
 
 if TYPE_CHECKING:
     from rtgs.config.schema import RunConfig
@@ -140,26 +139,13 @@ def parse_words(words: Sequence[str]) -> ViewWords:
     Raises:
         RtgsError: names the word and what may stand there.
     """
-    found: dict[str, Any] = {}
-    known = [item.name for item in fields(ViewWords) if item.name != "run"]
-    for word in words:
-        key, equals, value = word.partition("=")
-        if word.startswith("-"):
-            raise RtgsError(f"rtgs view has no option {word}: write key=value\n\n{HELP}")
-        name = key if equals else "run"
-        if name in found:
-            raise RtgsError(f"rtgs view: {'one run at a time' if not equals else f'{key}= is given twice'}")
-        if equals and key not in known:
-            close = difflib.get_close_matches(key, known, n=1)
-            hint = f"did you mean {close[0]}=?" if close else f"there are {', '.join(known)}"
-            raise RtgsError(f"rtgs view: {key}= is no word of it; {hint}")
-        found[name] = _value(key, value) if equals else word
-    return ViewWords(**found)
+    return ViewWords(**read_words("rtgs view", words, _READERS, options="is no word of it: write key=value", help=HELP))
 
 
-def _value(key: str, value: str) -> object:
-    if key in ("port", "long_side", "threads"):
-        if not value.isdecimal() or len(value) > 6 or (key == "threads" and not 1 <= int(value) <= 1024):
-            raise RtgsError(f"rtgs view: {key}={value} must be a whole number{' from 1 to 1024' * (key == 'threads')}")
-        return int(value)
-    return Path(value).expanduser() if key == "root" else value
+_READERS: dict[str, Reader] = {
+    "host": str,
+    "port": whole(0, HIGHEST_PORT),
+    "long_side": whole(0, LARGEST_SIDE),
+    "threads": THREADS,
+    "root": place,
+}

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from rtgs.core.refuse import refuse_unless
 
 HIGHEST_PORT = 65535
+LARGEST_SIDE = 8192
 
 
 @dataclass(frozen=True)
@@ -28,4 +29,4 @@ class ViewerSettings:
         refuse_unless(0 <= self.port <= HIGHEST_PORT, "viewer.port", self.port, f"0 to {HIGHEST_PORT}")
         refuse_unless(0 < self.share <= 1, "viewer.share", self.share, "above 0 and at most 1")
         side = self.long_side
-        refuse_unless(side == 0 or 16 <= side <= 8192, "viewer.long_side", side, "16 to 8192, or 0")
+        refuse_unless(side == 0 or 16 <= side <= LARGEST_SIDE, "viewer.long_side", side, f"16 to {LARGEST_SIDE}, or 0")

@@ -118,10 +118,10 @@ def test_the_newest_run_is_shown_and_what_is_gone_is_told(run, root, tmp_path, c
         (["a", "b"], "a and b: one run at a time"),
         (["frames=0"], "frames=0 must be a whole number from 1 to 20000"),
         (["size=8"], "size=8 is no size such as 640x480"),
-        (["format=gif"], "format=gif is unknown: choose some of png, mp4, webp"),
+        (["format=gif"], "format=gif holds 'gif': choose some of png, mp4, webp"),
         (["layers=final"], "did you mean layer="),
         (["fps=2", "fps=3"], "fps= is given twice"),
-        (["a", "--frames"], "--frames are for FILE.ply"),
+        (["a", "--frames"], "--frames is for FILE.ply"),
     ],
 )
 def test_words_that_are_refused(words, message):

@@ -242,10 +242,10 @@ def test_a_page_is_opened_for_what_trains_here_alone(name, remote, opens, monkey
     [
         (["a", "b"], "one run at a time"),
         (["por=1"], "did you mean port="),
-        (["port=x"], "port=x must be a whole number"),
+        (["port=x"], "port=x must be a whole number from 0 to 65535"),
         (["threads=0"], "threads=0 must be a whole number from 1 to 1024"),
         (["port=1", "port=2"], "port= is given twice"),
-        (["--port", "1"], "no option --port: write key=value"),
+        (["--port", "1"], "--port is no word of it: write key=value"),
     ],
 )
 def test_words_that_are_refused_by_the_viewer(words, message):
