@@ -1,4 +1,4 @@
-"""Ref-Gaussian: its published numbers, its equations, visibility and indirect light, resume, what it refuses."""
+"""Ref-Gaussian: its published numbers, its equations, visibility and indirect light, resume."""
 
 from __future__ import annotations
 
@@ -7,70 +7,37 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from reflective_cases import new_method, recipe, schedule, tiny, train_all, train_step, training_maps
+from ref_gaussian_cases import CUBEMAP, INDIRECT, MATERIALS, STEP, mirror, settings, trained
+from reflective_cases import new_method, schedule, tiny, train_step, training_maps
 from torch import Tensor
 from training_cases import small_scene
 
-from benchmarks.common.mirror_scene import MirrorScene
 from rtgs.config import compose
-from rtgs.core.errors import RtgsError
 from rtgs.gaussians.density import logit
 from rtgs.gaussians.harmonics import SH_C0, sh_basis
-from rtgs.gaussians.ply import read_gaussians, write_ply
 from rtgs.gaussians.surfels import activate
 from rtgs.light.cubemap import CubemapLight
 from rtgs.light.faces import texel_directions
-from rtgs.light.settings import EnvironmentSettings
 from rtgs.mesh.guide import MeshGuide
 from rtgs.mesh.triangles import TriangleMesh
 from rtgs.methods import Mode, RenderOptions, Stage, create_method, find_method
 from rtgs.methods.model import Model
 from rtgs.methods.parts import visibility
 from rtgs.methods.parts.kinds import surfel_options
-from rtgs.methods.parts.part import Frame
 from rtgs.methods.parts.split_sum_mirror import (
-    ALBEDO,
     INDIRECT_DC,
     INDIRECT_REST,
     METALNESS,
     ROUGHNESS,
-    SplitSumMirror,
     light_harmonics,
 )
 from rtgs.methods.ref_gaussian import RefGaussianSettings
-from rtgs.methods.settings import MethodSettings
 from rtgs.methods.shading.split_sum import mean_normal, mirrored
 from rtgs.optics.split_sum import lobe_factors, split_sum_factors
 from rtgs.render.discontinuities.surfels import discontinuity_mask
 from rtgs.render.reference import surfels as reference
 from rtgs.train.seeds import generator_for
-from rtgs.train.settings import LossSettings, ScheduleSettings
 from tests.mesh.shapes import sphere
-
-STEP = 40
-CUBEMAP = EnvironmentSettings(side=8, mips="ggx", levels=(8, 4, 2), noise=1.0)
-MATERIALS = (METALNESS, ROUGHNESS, ALBEDO)
-INDIRECT = (INDIRECT_DC, INDIRECT_REST)
-
-
-def settings(**own) -> MethodSettings:
-    """The family's short recipe with a small cubemap; every mechanism acts within 60 steps."""
-    found = recipe("ref_gaussian")
-    materials = replace(found.materials, specular=0.2, roughness=0.3)
-    keys = {"indirect_from": 0.5, "mesh_every": 0.2, "mesh_cells": 24, "mesh_pieces": 0, "reach": 0.0, **own}
-    loss = LossSettings(normal=0.05, normal_start=0.0)
-    return replace(found, loss=loss, environment=CUBEMAP, materials=materials, own=keys)
-
-
-def trained(**own) -> tuple[Model, MirrorScene]:
-    made = tiny()
-    return train_all(settings(**own), made, schedule()), made
-
-
-def mirror(method: Model) -> SplitSumMirror:
-    part = method.parts["mirror"]
-    assert isinstance(part, SplitSumMirror)
-    return part
 
 
 def test_the_published_numbers():
@@ -303,86 +270,6 @@ def test_meshes_have_one_order():
     assert np.isinf(MeshGuide(one, 0.0).distance(origin, -direction)).all()
 
 
-# ---- shading of surfels, as published for synthetic scenes
-
-
-def test_surfels_are_shaded_one_by_one_first():
-    """From 15 to 24 under one cubemap, then materials begin anew under another; only then colours get noise."""
-    made = tiny()
-    method, other = (new_method(settings(forward_until=0.4), made, schedule()) for _ in range(2))
-    part, base, events = mirror(method), method["base"], {}
-    for stage in method.stages:
-        events[stage.from_step] = [each.set_name for each in method.begin(stage)]
-    assert events[15] == ["forward_environment"]
-    assert [group.name for group in method.groups] == ["forward_environment"]
-    for step in range(15, 23):
-        train_step(method, made, step)
-    assert bool((base.gaussians[ALBEDO] != 0).any()), "initial 0.5"
-    other.load({name: tensor.clone() for name, tensor in method.state().items()})
-    view = made.scene.train[0]
-    assert torch.equal(*(m.render(view.camera, 22, Mode.EVALUATE).image for m in (method, other)))
-    kinds = [each.kind for each in train_step(method, made, 23)[1]]
-    assert kinds.count("begin") == 1
-    assert [group.name for group in method.groups] == ["environment"]
-    assert torch.equal(base.gaussians[METALNESS].detach(), torch.full((len(base),), logit(0.2)))
-    assert not base.gaussians[ALBEDO].any()
-    train_step(other, made, 23)
-    for step in range(24, 40):
-        train_step(method, made, step)
-        train_step(other, made, step)
-    expected, found = method.state(), other.state()
-    assert [name for name in expected if not torch.equal(found[name], expected[name])] == []
-    assert method.base.painter is part, "indirect light has begun"
-    asked = settings()
-    spared = replace(asked.reflection, propagation=replace(asked.reflection.propagation, sabotage=0.0))
-    real, calm = (mirror(new_method(found, made, schedule())) for found in (asked, replace(asked, reflection=spared)))
-    for each, following, moved in ((part, 48, True), (part, 20, False), (real, 48, True), (calm, 48, False)):
-        gaussians = each.base.set.gaussians
-        if METALNESS not in gaussians:
-            each._adopt((METALNESS,))
-            gaussians = each.base.set.gaussians
-        with torch.no_grad():
-            gaussians[METALNESS].fill_(-9.0)
-        before = gaussians.sh_dc.detach().clone()
-        event = each._propagated(following)
-        assert torch.equal(gaussians.sh_dc.detach(), before) != moved
-        assert event.detail.endswith(f"colours of {len(gaussians) if moved else 0} disturbed")
-
-
-def test_a_shaded_surfel_is_its_equation():
-    """In float64, from formulas written out; every gradient too."""
-    made = tiny()
-    method = new_method(settings(forward_until=0.4), made, schedule())
-    method.begin(Stage("reflection", 15, 60))
-    part, generator = mirror(method), torch.Generator().manual_seed(5)
-    base, camera = method["base"].gaussians, made.scene.train[0].camera
-    with torch.no_grad():
-        for name in MATERIALS:
-            base[name] += torch.randn(base[name].shape, generator=generator)
-    exact = base.like({name: tensor.detach().double().requires_grad_() for name, tensor in base.items()})
-    texels = method.groups[0]["texels"].detach().double().requires_grad_()
-    light = CubemapLight(texels, CUBEMAP)
-    rows = activate(exact, camera.center, 0)
-    normals = torch.linalg.cross(rows.tangent_u, rows.tangent_v, dim=1)
-    to_eye = torch.nn.functional.normalize(camera.center - rows.means, dim=1)
-    normals = normals * (normals * to_eye).sum(1, keepdim=True).sign()
-    cosine = (normals * to_eye).sum(1, keepdim=True)
-    metal, rough, albedo = (exact[name].sigmoid().reshape(len(exact), -1) for name in MATERIALS)
-    scale, bias = (each[:, None] for each in split_sum_factors(cosine[:, 0], rough[:, 0] ** 2))
-    weight = (0.04 * (1 - metal) + albedo * metal) * scale + bias
-    expected = (1 - metal) * albedo * light.irradiance(normals)
-    expected = expected + weight * light(2 * cosine * normals - to_eye, rough[:, 0])
-    frame = Frame(camera, 20, Mode.TRAIN, RenderOptions())
-    found = part.paint(frame, method["base"].activated(camera.center.float(), 0))
-    torch.testing.assert_close(found[:, :3].double(), expected, atol=2e-5, rtol=0)
-    upstream = torch.randn(expected.shape, generator=generator, dtype=torch.float64)
-    (expected * upstream).sum().backward()
-    (found[:, :3] * upstream.float()).sum().backward()
-    pairs = [(base[name].grad, exact[name].grad, name) for name in ("quaternions", "means", *MATERIALS)]
-    for ours, twin, name in (*pairs, (method.groups[0]["texels"].grad, texels.grad, "texels")):
-        assert float((ours.double() - twin).norm() / twin.norm()) < 2e-3, name
-
-
 # ---- training
 
 
@@ -456,62 +343,6 @@ def test_smooth_normals_cost_nothing_unless_asked_for():
     assert "smooth" in [term.name for term in alone.losses(alone.render(view.camera, 9, Mode.TRAIN), view, 9).terms]
     late = asked.losses(asked.render(view.camera, 54, Mode.TRAIN), view, 54).terms
     assert "smooth" not in [term.name for term in late], "until nine tenths"
-
-
-# ---- recipes and files
-
-
-@pytest.mark.parametrize(
-    ("own", "message"),
-    [
-        ({"normal": "median"}, "method.own.normal"),
-        ({"albedo": 1.0}, "method.own.albedo"),
-        ({"indirect_start": "warm"}, "method.own.indirect_start"),
-        ({"indirect_from": 1.5}, "method.own.indirect_from"),
-        ({"mesh_every": 0.0}, "method.own.mesh_every"),
-        ({"mesh_cells": 1}, "method.own.mesh_cells"),
-        ({"reach": -1.0}, "method.own.reach"),
-        ({"mesh": 1.0}, "method.own.mesh is no key"),
-    ],
-)
-def test_keys_that_make_no_sense_are_refused(own: dict, message: str):
-    with pytest.raises((RtgsError, ValueError), match=message):
-        create_method(settings(**own), small_scene(), ScheduleSettings(total=10), generator_for(0, "initialise"))
-
-
-@pytest.mark.parametrize("share", [0.1, 0.25])
-def test_a_first_part_that_ends_before_the_stage_begins_is_refused(share: float):
-    spec, asked = find_method("ref_gaussian"), settings(forward_until=share)
-    message = rf"forward_until={share} is step \d+ of 60, but .* from step 15 on \(method.reflection.start=0.25\)"
-    with pytest.raises(RtgsError, match=message):
-        spec.timeline(asked, schedule())
-    with pytest.raises(RtgsError, match=message):
-        create_method(asked, small_scene(), schedule(), generator_for(0, "initialise"))
-    assert len(spec.timeline(spec.stage("diffuse").reads(asked), schedule())) == 2
-    assert len(spec.timeline(settings(forward_until=0.3), schedule())) == 2
-
-
-def test_the_first_stage_reads_nothing_of_the_second():
-    spec = find_method("ref_gaussian")
-    one, other = settings(reach=4.0), replace(settings(), environment=EnvironmentSettings(side=64))
-    assert spec.stage("diffuse").reads(one) == spec.stage("diffuse").reads(other)
-    assert spec.stage("reflection").reads(one) != spec.stage("reflection").reads(settings())
-
-
-def test_named_properties_and_back(tmp_path):
-    method, made = trained()
-    gaussians = method["base"].gaussians
-    path = tmp_path / "base.ply"
-    write_ply(path, gaussians)
-    head = path.read_bytes()[:6000]
-    for name in (b"metalness", b"roughness", b"albedo_2", b"indirect_dc_0", b"indirect_rest_44"):
-        assert b"property float " + name + b"\n" in head
-    found = read_gaussians(path, channels=gaussians.channels)
-    for name, tensor in gaussians.items():
-        assert torch.equal(found[name], tensor.detach()), name
-    assert isinstance(method.light, CubemapLight)
-    assert method.light.settings.mips == "ggx"
-    assert made.scene.name
 
 
 def test_indirect_light_may_begin_as_the_cubemap_looks():
