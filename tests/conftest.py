@@ -1,11 +1,18 @@
 """Settings and fixtures shared by all tests."""
 
+import os
 from collections.abc import Iterator
 
 import pytest
 import torch
+from hypothesis import settings
 
 from rtgs.native import core
+
+# The same examples on every machine: what a random search finds is a finding of the day it is found, not a failure of
+# the change under test. `HYPOTHESIS_PROFILE=default pytest` searches at random; so does `make fuzz`.
+settings.register_profile("repeatable", derandomize=True, database=None)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "repeatable"))
 
 
 @pytest.fixture(autouse=True)

@@ -98,10 +98,12 @@ def _text(path: Path, most: int) -> str:
 
 
 def _reason(error: Exception) -> DocumentError:
-    if isinstance(error, DocumentError):
-        return error
-    text = " ".join(str(error).split())
-    return DocumentError(text[:200] + ("..." if len(text) > 200 else ""))
+    return error if isinstance(error, DocumentError) else DocumentError(_shortened(" ".join(str(error).split())))
+
+
+def _shortened(text: str) -> str:
+    """For a message: what an attacker writes into a file may be long."""
+    return text[:200] + ("..." if len(text) > 200 else "")
 
 
 def _refuse_large_yaml(events: Iterable[Any]) -> None:
@@ -112,7 +114,7 @@ def _refuse_large_yaml(events: Iterable[Any]) -> None:
     for event in events:
         if isinstance(event, yaml.AliasEvent):
             if event.anchor not in sizes:
-                raise DocumentError(f"the alias *{event.anchor} stands for nothing, or for itself")
+                raise DocumentError(f"the alias *{_shortened(event.anchor)} stands for nothing, or for itself")
             open_counts[-1] += sizes[event.anchor]
         elif isinstance(event, yaml.CollectionStartEvent):
             open_counts.append(1)

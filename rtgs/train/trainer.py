@@ -5,11 +5,10 @@ from __future__ import annotations
 import hashlib
 import math
 import platform
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import torch
 
@@ -34,6 +33,7 @@ from rtgs.train.memory import peak_memory_mb, start_peak_memory
 from rtgs.train.method import LossValue, Method, Mode, Stage, StepEvent
 from rtgs.train.onlooker import Onlooker, TrainingStopped
 from rtgs.train.progress import Progress, SilentProgress, StepReport
+from rtgs.train.recording import History, Observer, Recorder, RunningAverages
 from rtgs.train.resolution import GrowingViews
 from rtgs.train.seeds import seed_for
 from rtgs.train.settings import WatchSettings
@@ -42,28 +42,6 @@ from rtgs.train.watch import Watch, look, why_idle
 
 REPORT_EVERY = 10  # steps between looks at the PSNR of a training view
 RECORD_EVERY = 50  # steps between batches of metrics
-AVERAGE_DECAY = 0.95  # of the running averages, per look
-
-
-class Recorder(Protocol):
-    """Where metrics go: any tracker of ``rtgs.track``."""
-
-    def metrics(self, values: Mapping[str, float], step: int) -> None: ...
-
-
-@runtime_checkable
-class History(Recorder, Protocol):
-    """A recorder that outlives the attempt it was made in."""
-
-    def forget_after(self, step: int) -> None:
-        """Training goes on from ``step``: what an attempt before recorded of later steps did not lead to the result."""
-        ...
-
-
-class Observer(Protocol):
-    """Looks at the method after every step, and leaves it as it was."""
-
-    def look(self, method: Method, step: int) -> None: ...
 
 
 @dataclass(frozen=True)
@@ -81,20 +59,6 @@ class TrainSummary:
     psnr_test: float | None  # mean over the test views, dB; None where the scene has none
     resumed_from: int | None  # step of the checkpoint this process went on from
     decisions: tuple[Decision, ...]
-
-
-@dataclass
-class RunningAverages:
-    """Exponential averages of what the user watches."""
-
-    loss: float | None = None
-    psnr: float | None = None
-
-    def add_loss(self, value: float) -> None:
-        self.loss = value if self.loss is None else AVERAGE_DECAY * self.loss + (1 - AVERAGE_DECAY) * value
-
-    def add_psnr(self, value: float) -> None:
-        self.psnr = value if self.psnr is None else AVERAGE_DECAY * self.psnr + (1 - AVERAGE_DECAY) * value
 
 
 class Trainer:

@@ -56,6 +56,7 @@ def test_a_bomb_of_aliases_is_refused_before_it_grows(tmp_path):
     assert len(BOMB) < 500
     refused(load_yaml, written(tmp_path, "a.yaml", BOMB), "more than 1000000 values, aliases written out")
     refused(load_yaml, written(tmp_path, "a.yaml", "a: &a [*a]"), r"alias \*a stands for nothing, or for itself")
+    refused(load_yaml, written(tmp_path, "a.yaml", f"a: *{'9' * 5000}"), r"alias \*9{200}\.\.\. stands for nothing")
 
 
 @pytest.mark.parametrize("depth", [DEPTH + 1, 500, 100_000])

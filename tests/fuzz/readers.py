@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from functools import cache
+from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -20,12 +19,6 @@ from rtgs.core.cameras import Camera
 from rtgs.evaluate.external import read_external
 from rtgs.evaluate.records import METRICS, EvaluationTable, RunFacts, ViewScore, read_json, write_json
 from rtgs.evaluate.settings import ExternalSettings
-from rtgs.export.compressed_ply import read_compressed_ply, write_compressed_ply
-from rtgs.export.glass import GlassObject
-from rtgs.export.gltf import read_glb, write_glb
-from rtgs.export.spz import read_spz, write_spz
-from rtgs.gaussians.ply import read_gaussians, read_ply, write_ply
-from rtgs.gaussians.surfels import Surfels
 from rtgs.mesh.record import MeshRecord
 from rtgs.mesh.triangles import TriangleMesh, read_mesh_obj, read_mesh_ply, write_mesh_obj, write_mesh_ply
 from rtgs.prepare.masks.drawn import read_drawing
@@ -50,38 +43,9 @@ from rtgs.scenes.truth import ViewTruth, read_truth, write_truth
 from rtgs.scenes.undistort import Lens
 from rtgs.train.checkpoint import Checkpoint, CheckpointRecord, load_checkpoint, save_checkpoint
 from rtgs.workflow.manifest import Manifest
+from tests.fuzz.reader import Files, Reader, files_of
+from tests.fuzz.splats import SPLATS
 from tests.scenes import captures
-
-Files = dict[str, bytes]
-
-
-@dataclass(frozen=True)
-class Reader:
-    """One reader.
-
-    Attributes:
-        make: sound files by their place in a folder.
-        damaged: the places that mutations change, one at a time.
-        read: reads the folder; an AssertionError says that it took nonsense.
-    """
-
-    name: str
-    make: Callable[[], Files]
-    damaged: tuple[str, ...]
-    read: Callable[[Path], object]
-
-
-def _files_of(write: Callable[[Path], object]) -> Callable[[], Files]:
-    """What ``write`` leaves in a folder; made once."""
-
-    @cache
-    def make() -> Files:
-        with TemporaryDirectory() as place:
-            write(Path(place))
-            found = [path for path in sorted(Path(place).rglob("*")) if path.is_file()]
-            return {path.relative_to(place).as_posix(): path.read_bytes() for path in found}
-
-    return make
 
 
 def _capture(folder: Path) -> None:
@@ -109,7 +73,7 @@ def _colmap(*, text: bool, model: str = "PINHOLE") -> Callable[[], Files]:
     def write(folder: Path) -> None:
         captures.ColmapCapture(folder, views=4, points=12, text=text, model=model, params=params).write()
 
-    return _files_of(write)
+    return files_of(write)
 
 
 def _parts(suffix: str) -> tuple[str, ...]:
@@ -125,60 +89,6 @@ def _write_transforms(folder: Path) -> None:
 def _write_blender(folder: Path) -> None:
     captures.write_transforms(folder, views=4, camera_angle_x=0.8)
     (folder / "transforms.json").rename(folder / "transforms_train.json")
-
-
-def _gaussians(*, text: bool) -> Callable[[Path], None]:
-    def write(folder: Path) -> None:
-        random = torch.Generator().manual_seed(0)
-        shapes = {"means": (6, 3), "log_scales": (6, 2), "quaternions": (6, 4), "opacity_logits": (6,)}
-        shapes |= {"sh_dc": (6, 3), "sh_rest": (6, 3, 3)}
-        tensors = {name: torch.randn(shape, generator=random) for name, shape in shapes.items()}
-        write_ply(folder / "a.ply", Surfels(**tensors))
-        if text:
-            import plyfile
-
-            stored = plyfile.PlyData.read(str(folder / "a.ply"), mmap=False)  # it is written over
-            stored.text = True
-            stored.write(str(folder / "a.ply"))
-
-    return write
-
-
-def _read_gaussians(folder: Path) -> None:
-    gaussians = read_gaussians(folder / "a.ply")
-    assert all(torch.isfinite(values).all() for _, values in gaussians.items())
-
-
-def _write_glb(folder: Path) -> None:
-    _gaussians(text=False)(folder)
-    corners = np.eye(3, dtype=np.float32)
-    glass = GlassObject(corners, corners, np.array([[0, 1, 2]]), 1.5, (1.0, 1.0, 1.0), 0.0)
-    write_glb(folder / "a.glb", read_ply(folder / "a.ply"), glass=glass)
-
-
-def _read_glb(folder: Path) -> None:
-    found = read_glb(folder / "a.glb")
-    assert all(torch.isfinite(values).all() for _, values in found.splats.items())
-    assert np.isfinite(found.vertices).all()
-    assert not len(found.faces) or found.faces.max() < len(found.vertices)
-
-
-def _write_compressed(folder: Path) -> None:
-    _gaussians(text=False)(folder)
-    write_compressed_ply(folder / "b.ply", read_ply(folder / "a.ply"))
-
-
-def _read_compressed(folder: Path) -> None:
-    assert all(torch.isfinite(values).all() for _, values in read_compressed_ply(folder / "b.ply").items())
-
-
-def _write_spz(folder: Path) -> None:
-    _gaussians(text=False)(folder)
-    write_spz(folder / "a.spz", read_ply(folder / "a.ply"))
-
-
-def _read_spz(folder: Path) -> None:
-    assert all(torch.isfinite(values).all() for _, values in read_spz(folder / "a.spz").items())
 
 
 MESH = TriangleMesh(np.eye(4, 3), np.array([[0, 1, 2], [1, 2, 3]]), np.full((4, 3), 0.5))
@@ -412,7 +322,7 @@ def _described() -> Files:
 
 
 def _obj() -> Files:
-    return _files_of(lambda folder: write_mesh_obj(folder / "a.obj", MESH))()
+    return files_of(lambda folder: write_mesh_obj(folder / "a.obj", MESH))()
 
 
 READERS: dict[str, Reader] = {
@@ -421,39 +331,35 @@ READERS: dict[str, Reader] = {
         Reader("colmap binary", _colmap(text=False), _parts(".bin"), _capture),
         Reader("colmap lens", _colmap(text=False, model="OPENCV"), _parts(".bin")[:1], _capture),
         Reader("colmap text", _colmap(text=True), _parts(".txt"), _capture),
-        Reader("transforms", _files_of(_write_transforms), ("transforms.json",) * 3 + ("points.ply",), _capture),
-        Reader("blender", _files_of(_write_blender), ("transforms_train.json",), _capture),
+        Reader("transforms", files_of(_write_transforms), ("transforms.json",) * 3 + ("points.ply",), _capture),
+        Reader("blender", files_of(_write_blender), ("transforms_train.json",), _capture),
         Reader("capture photo", _colmap(text=False), ("images/photo_01.png",), _capture),
-        Reader("splat", _files_of(_gaussians(text=False)), ("a.ply",), _read_gaussians),
-        Reader("splat text", _files_of(_gaussians(text=True)), ("a.ply",), _read_gaussians),
-        Reader("glb", _files_of(_write_glb), ("a.glb",), _read_glb),
-        Reader("spz", _files_of(_write_spz), ("a.spz",), _read_spz),
-        Reader("compressed splat", _files_of(_write_compressed), ("b.ply",), _read_compressed),
-        Reader("points", _files_of(_write_transforms), ("points.ply",), lambda f: read_point_file(f / "points.ply")),
-        Reader("mesh ply", _files_of(lambda f: write_mesh_ply(f / "a.ply", MESH)), ("a.ply",),
+        *SPLATS,
+        Reader("points", files_of(_write_transforms), ("points.ply",), lambda f: read_point_file(f / "points.ply")),
+        Reader("mesh ply", files_of(lambda f: write_mesh_ply(f / "a.ply", MESH)), ("a.ply",),
                _mesh(read_mesh_ply, "a.ply")),
         Reader("mesh obj", _obj, ("a.obj",), _mesh(read_mesh_obj, "a.obj")),
-        Reader("photos", _files_of(_write_photos), ("a.jpg", "b.png", "c.png", "d.tif", "e.bmp", "f.webp"),
+        Reader("photos", files_of(_write_photos), ("a.jpg", "b.png", "c.png", "d.tif", "e.bmp", "f.webp"),
                _read_photos),
-        Reader("normals", lambda: _files_of(_write_normals)() | {"d.npy": _files_of(_write_normals)()["a.npy"]},
+        Reader("normals", lambda: files_of(_write_normals)() | {"d.npy": files_of(_write_normals)()["a.npy"]},
                ("a.npy", "b.npy", "c.png"), _read_normals),
         Reader("marks", lambda: {"masks.yaml": MARKS}, ("masks.yaml",), _read_marks),
         Reader("marks json", lambda: {"a.json": b'{"cutouts": {"c.jpg": {"box": [1, 6, 42, 56]}}, "panes": {}}'},
                ("a.json",), _read_marks),
-        Reader("metrics.json", _files_of(_write_metrics), ("metrics.json",), _read_metrics),
-        *(Reader(name, _files_of(_write_records), (name,), _record(name)) for name in RECORDS),
-        Reader("manifest.json", _files_of(_write_records), ("manifest.json",), _read_manifest),
-        Reader("external", _files_of(_write_external), ("renders/left/a.png", "renders/b.jpg",
+        Reader("metrics.json", files_of(_write_metrics), ("metrics.json",), _read_metrics),
+        *(Reader(name, files_of(_write_records), (name,), _record(name)) for name in RECORDS),
+        Reader("manifest.json", files_of(_write_records), ("manifest.json",), _read_manifest),
+        Reader("external", files_of(_write_external), ("renders/left/a.png", "renders/b.jpg",
                "layers/reflection/b.npy", "layers/depth/b.npy", "layers/normal/b.npy"), _read_external),
         Reader("camera path", _camera_path, ("camera_path.json",), _read_camera_path),
         Reader("description", _described, ("scene.toml",), lambda f: read_description(f / "scene.toml")),
-        Reader("scene.json", _files_of(_write_scene), ("scene.json",) * 3 + ("points.safetensors",
+        Reader("scene.json", files_of(_write_scene), ("scene.json",) * 3 + ("points.safetensors",
                "views/00000.safetensors"), _read_scene),
-        Reader("checkpoint", _files_of(_write_checkpoint), ("step_00000003/record.json",) * 2
+        Reader("checkpoint", files_of(_write_checkpoint), ("step_00000003/record.json",) * 2
                + ("step_00000003/state.safetensors",), _read_checkpoint),
-        Reader("weights", _files_of(_write_weights), ("a.safetensors", "b.pth"), _read_weights),
+        Reader("weights", files_of(_write_weights), ("a.safetensors", "b.pth"), _read_weights),
         Reader("dataparser", _transform, ("dataparser_transforms.json",), _read_transform),
-        Reader("truth", _files_of(_write_truth), ("depth.png", "normal.png", "objects.png", "diffuse.png"),
+        Reader("truth", files_of(_write_truth), ("depth.png", "normal.png", "objects.png", "diffuse.png"),
                _read_truth),
     )
 }  # fmt: skip
