@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from pipelines.cli.training_picture import picture_of_run
 from pipelines.cli.view_run import viewed
 from pipelines.planning.plan import describe, remote_store
 from pipelines.planning.sweep import Sweep
@@ -89,7 +90,9 @@ def execute(config: RunConfig, choices: Choices, membership: Membership | None =
         log.info("%s", decision)
     log.info("%s", describe(plan))
     tracking = open_tracker(config)
-    with _process(None if plan.complete else config), viewed(config, plan) as onlooker:
+    with _process(None if plan.complete else config), viewed(config, plan) as viewer:
+        alone = membership.sweep is None  # jobs of a sweep have nobody who waits for a picture
+        onlooker = viewer or (picture_of_run(config) if alone else None)
         run = _Run(config, choices, plan, command(choices), store, remote, tracking, membership, onlooker)
         outcome = _execute(run)
     _show(outcome.results, outcome.folder)

@@ -39,6 +39,7 @@ from rtgs.workflow import Artifacts, Plan, Step, StepResult, Store
 CONFIG_FILE = "config.yaml"
 INSTALLED_FILE = "requirements.txt"
 SHOWN = "shown"  # what `rtgs show` made of this model
+TRAINING_PICTURE = "training.jpg"  # while it trains
 _TRACKED_IMAGES = 4
 log = logging.getLogger("rtgs")
 _NOT_TOLD = ("paths.", "tracking.", "table.")  # where results go, not what they are
@@ -98,7 +99,13 @@ def _fill_run_folder(
         log.info("%s", replaced(folder, known, command))
     folder.mkdir(parents=True, exist_ok=True)
     (folder / RUN_FILE).unlink(missing_ok=True)  # written last: a folder without it is incomplete
-    for pattern in ("*.ply", "mesh.*", RECORD_FILE, PREVIEW):  # of another run of this name, with other stages
+    for pattern in (
+        "*.ply",
+        "mesh.*",
+        RECORD_FILE,
+        PREVIEW,
+        TRAINING_PICTURE,
+    ):  # of another run of this name, with other stages
         for left in folder.glob(pattern):
             left.unlink(missing_ok=True)
     shutil.rmtree(folder / SHOWN, ignore_errors=True)
