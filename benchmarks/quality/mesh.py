@@ -7,8 +7,8 @@ are shipped captures, by name (default: ball_statue). Times are CPU seconds of o
 
 from __future__ import annotations
 
+import argparse
 import resource
-import sys
 import time
 from pathlib import Path
 
@@ -78,7 +78,9 @@ def measure(name: str, scene: Scene) -> list[str]:
 
 def main() -> None:
     """Print the table and what Open3D costs."""
-    words = sys.argv[1:] or ["ball_statue"]
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scenes", nargs="*", default=["ball_statue"], help="names or folders")
+    words = parser.parse_args().scenes
     folders = [embedded_capture(word) if word in embedded_names() else Path(word) for word in words]
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     start = time.process_time()

@@ -9,6 +9,7 @@ lookup), ``made_seconds`` what making the weights takes, once per process.
 
 from __future__ import annotations
 
+import argparse
 import json
 import time
 from collections.abc import Callable
@@ -116,6 +117,7 @@ def figures(
 
 
 def main() -> None:
+    argparse.ArgumentParser(description=__doc__).parse_args()
     torch.set_num_threads(1)
     found = figures()
     for name in (*STEP, "step", f"lookup_{ONE_LEVEL}"):

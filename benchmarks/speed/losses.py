@@ -8,6 +8,7 @@ shapes: ``perceptual_crop_ms`` (the random crop that training looks at) and ``pe
 
 from __future__ import annotations
 
+import argparse
 import json
 import time
 from collections.abc import Callable
@@ -105,6 +106,7 @@ def perceptual_figures(size: tuple[int, int], widths: tuple[int, ...] = VGG16_WI
 
 
 def main() -> None:
+    argparse.ArgumentParser(description=__doc__).parse_args()
     torch.set_num_threads(1)
     results: dict[str, float | str] = {"isa": core.isa()}
     for width, height in SIZES:

@@ -236,7 +236,7 @@ def measure(arguments: argparse.Namespace, kept: dict[str, Any]) -> dict[str, An
 def parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])  # type: ignore[union-attr]
     add = parser.add_argument
-    add("--quick", action="store_true", help="under two minutes: a smaller kernel scene, three short runs of demo")
+    add("--quick", action="store_true", help="about three minutes: a smaller kernel scene, three short runs of demo")
     add("--parts", nargs="*", choices=PARTS, default=list(PARTS))
     add("--surfels", type=int, help="of the kernel scene (1000; quick: 500)")
     add("--width", type=int, help="of the kernel scene's picture in pixels (96; quick: 64)")

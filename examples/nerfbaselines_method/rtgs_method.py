@@ -19,6 +19,7 @@ from rtgs.core.documents import load_json
 from rtgs.scenes.canonical import read_scene, save_scene
 from rtgs.scenes.points import camera_extent
 from rtgs.train.losses import surface_depth
+from rtgs.train.resolution import GrowingViews
 from rtgs.train.seeds import seed_for
 from rtgs.train.view_order import OrderState, ViewOrder
 
@@ -52,6 +53,7 @@ class RtgsMethod:
         generator = rtgs.generator_for(config.seed, "initialise")
         self.model = rtgs.create_method(config.method, self._scene, config.schedule, generator)
         self._order = ViewOrder(len(self._scene.train), seed_for(config.seed, "views"))
+        self._growing = GrowingViews(self._scene.train, config.schedule)
         self._step = int(found.get("step", 0))
         self._loaded = self._step if self._checkpoint is not None else None
         if self._checkpoint is not None:
@@ -98,7 +100,7 @@ class RtgsMethod:
         for stage in self.model.stages:
             if step == stage.from_step:
                 self.model.begin(stage)
-        view = self._scene.train[self._order.next()]
+        view = self._growing.at(self._order.next(), step)
         rendered = self.model.render(view.camera, step, rtgs.Mode.TRAIN, mask=view.mask)
         losses = self.model.losses(rendered, view, step)
         losses.total.backward()

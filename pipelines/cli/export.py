@@ -24,7 +24,7 @@ HELP = """rtgs export [RUN] [key=value ...]     a run: a folder, a name in runs/
   format=NAME[,NAME...]     default: ply
       ply             one set of Gaussians for every viewer; layers are baked into it, and what that loses is printed
       compressed_ply  the one set, packed to a quarter of the PLY; PlayCanvas, SuperSplat
-      spz             the one set, packed to a seventh of the PLY; Niantic
+      spz             the one set, packed to less than a fifth of the PLY; Niantic
       sog             the one set as pictures, for PlayCanvas; needs splat-transform (npm) on PATH
       glb             KHR_gaussian_splatting, and the glass as a mesh that lets light pass; glTF programs
       html            one page for any browser, phones too: the glass reflects and moves with the viewer

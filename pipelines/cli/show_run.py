@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -77,6 +78,7 @@ def show_run(words: Sequence[str], root: Path) -> int:
         layers = choose_layers(asked.layer.split(","), has, run.method.name)
         out = asked.out or folder / "shown" / f"{title}-{'all' if asked.layer == 'all' else '-'.join(layers)}"
         print(f"{folder.name}: {', '.join(layers)} from {len(cameras)} cameras, path {title}", flush=True)
+        _refuse_others(out / "frames")
         _write(run, cameras, layers, formats, asked.fps, out)
     if (folder / PAGE).is_file():
         link_files(folder / PAGE)
@@ -159,6 +161,17 @@ def _cameras_of_file(path: Path, asked: ShowWords) -> list[Camera]:
     cameras = read_camera_path(path, asked.size)
     transform = read_transform(asked.transform)
     return cameras if transform is None else [from_model_frame(camera, *transform) for camera in cameras]
+
+
+def _refuse_others(frames: Path) -> None:
+    """Frames are replaced as a folder, so nothing else may lie there.
+
+    Raises:
+        RtgsError: names what does.
+    """
+    other = next((each for each in sorted(frames.glob("*")) if not re.fullmatch(r"\d{5}\.png", each.name)), None)
+    if other is not None:
+        raise RtgsError(f"{other} is no frame of a film, and {frames} would be replaced: choose another out=FOLDER")
 
 
 def _write(

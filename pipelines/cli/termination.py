@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
+import sys
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -23,12 +24,14 @@ def sigterm_raises() -> Iterator[None]:
     """While open, a first SIGTERM raises :class:`Terminated` in the main thread; a second one ends the process at once.
 
     What it interrupts may wrap it in an error of its own, as Python 3.11 does while it makes a class: such an error
-    leaves the block as :class:`Terminated`. Without effect in other threads, where Python sets no handlers.
+    leaves the block as :class:`Terminated`. Where Python drops an exception, as in ``__del__``, the signal comes again.
+    Without effect in other threads, where Python sets no handlers.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGTERM, _terminate)
+    before, dropped = signal.signal(signal.SIGTERM, _terminate), sys.unraisablehook
+    sys.unraisablehook = lambda lost: _again() if isinstance(lost.exc_value, Terminated) else dropped(lost)
     try:
         yield
     except Exception as error:
@@ -36,12 +39,20 @@ def sigterm_raises() -> Iterator[None]:
             raise Terminated from error
         raise
     finally:
+        sys.unraisablehook = dropped
         signal.signal(signal.SIGTERM, signal.SIG_DFL if before is None else before)
 
 
 def _terminate(number: int, frame: FrameType | None) -> None:
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     raise Terminated
+
+
+def _again() -> None:
+    signal.signal(signal.SIGTERM, _terminate)
+    again = threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGTERM))
+    again.daemon = True
+    again.start()
 
 
 def _from_signal(error: BaseException | None) -> bool:
@@ -56,6 +67,7 @@ def serve_until_interrupted(command: Sequence[str], environment: Mapping[str, st
 
     None of them outlives this function.
     """
+    before = signal.getsignal(signal.SIGTERM)
     server = subprocess.Popen(command, env=dict(environment), start_new_session=True)
     try:
         return server.wait()
@@ -63,10 +75,14 @@ def serve_until_interrupted(command: Sequence[str], environment: Mapping[str, st
         return 0
     finally:
         _end_all(server)
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, before)
 
 
 def _end_all(server: subprocess.Popen[bytes]) -> None:
-    """End the group of a process that leads one: politely, then not."""
+    """End the group of a process that leads one: politely, then not. Another SIGTERM to this one does not stop that."""
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
     with suppress(ProcessLookupError):
         os.killpg(server.pid, signal.SIGTERM)
     with suppress(subprocess.TimeoutExpired, KeyboardInterrupt):

@@ -30,6 +30,10 @@ _TELL_EVERY = 20  # pictures
 _AGAIN = "delete it, and the same command makes it again"
 
 
+_WANTED = ("trained", "steps", "most", "clear", "version")
+"""Fields of a record that say of which model it is and how it was made."""
+
+
 @dataclass(frozen=True)
 class BakeRecord:
     """How the one set was made, beside it.
@@ -43,6 +47,7 @@ class BakeRecord:
         psnr: dB against the layered model on held-out cameras; None: nothing was fitted.
         layered_photos: dB of the layered model against the photos of the test views; None: there are none.
         baked_photos: dB of the one set against the same.
+        version: of the fit (:data:`rtgs.export.bake.BAKE_VERSION`).
         clear: all pictures are as if the walls of glass were not there: a program that draws them adds them.
     """
 
@@ -55,15 +60,11 @@ class BakeRecord:
     layered_photos: float | None = None
     baked_photos: float | None = None
     clear: bool = False
+    version: int = 0
 
     def fits(self, wanted: BakeRecord) -> bool:
         """Whether it was made of the same model in the same way."""
-        return (self.trained, self.steps, self.most, self.clear) == (
-            wanted.trained,
-            wanted.steps,
-            wanted.most,
-            wanted.clear,
-        )
+        return all(getattr(self, name) == getattr(wanted, name) for name in _WANTED)
 
     def says(self) -> str:
         """One line for people."""
@@ -161,14 +162,14 @@ def export_run(run: ShownRun, settings: BakeSettings, out: Path, *, clear: bool 
     Raises:
         RtgsError: a file there is damaged, or the fit left no Gaussian.
     """
-    from rtgs.export.bake import choose_cameras
+    from rtgs.export.bake import BAKE_VERSION, choose_cameras
     from rtgs.gaussians.ply import write_ply
     from rtgs.pretrained.weights import sha256_of
 
     name = f"{run.folder.name}-clear" if clear else run.folder.name
     ply, json = out / f"{name}.ply", out / f"{name}.json"
     steps = 0 if is_one_set(run) else settings.steps
-    wanted = BakeRecord(_trained(run), steps, settings.most or 0, clear=clear)
+    wanted = BakeRecord(_trained(run), steps, settings.most or 0, clear=clear, version=BAKE_VERSION)
     cameras = choose_cameras(run.scene)
     layered = tuple(_image(run, camera, clear) for camera in cameras.held)
     record = read_record(BakeRecord, json, _AGAIN) if json.is_file() and ply.is_file() else None

@@ -39,6 +39,8 @@ from rtgs.workflow import Artifacts, Plan, Step, StepResult, Store
 CONFIG_FILE = "config.yaml"
 INSTALLED_FILE = "requirements.txt"
 SHOWN = "shown"  # what `rtgs show` made of this model
+EXPORTS = "exports"  # and `rtgs export`
+BEFORE = "before"  # both, of the model that the folder showed before
 TRAINING_PICTURE = "training.jpg"  # while it trains
 _TRACKED_IMAGES = 4
 log = logging.getLogger("rtgs")
@@ -108,7 +110,8 @@ def _fill_run_folder(
     ):  # of another run of this name, with other stages
         for left in folder.glob(pattern):
             left.unlink(missing_ok=True)
-    shutil.rmtree(folder / SHOWN, ignore_errors=True)
+    if known is None or known.steps != steps:
+        _put_aside(folder)
     places = folders(results)
     shutil.copyfile(places["report"] / PAGE, folder / PAGE)
     for name in (TABLE_JSON, TABLE_CSV):
@@ -134,6 +137,16 @@ def _fill_run_folder(
     finished = datetime.now(UTC).isoformat(timespec="seconds")
     RunRecord(str(config.name), command, finished, asdict(choices), steps).write(folder)
     return folder
+
+
+def _put_aside(folder: Path) -> None:
+    """Films and exports are of the model that the folder showed until now."""
+    for name in (SHOWN, EXPORTS):
+        if (folder / name).is_dir():
+            (folder / BEFORE).mkdir(exist_ok=True)
+            shutil.rmtree(folder / BEFORE / name, ignore_errors=True)
+            (folder / name).rename(folder / BEFORE / name)
+            log.info("%s are of the model before: now in %s", folder / name, folder / BEFORE / name)
 
 
 def replaced(folder: Path, before: RunRecord, command: str) -> str:

@@ -8,6 +8,7 @@ from pathlib import Path
 from pipelines.publishing.results import evaluation_of, was_trained
 from rtgs.config.schema import RunConfig
 from rtgs.core.errors import RtgsError
+from rtgs.core.files import whole_file
 from rtgs.evaluate.curves import Look, QualityCurve, comma_separated, markdown, with_pause
 from rtgs.runs.training import read_history, stage_params
 from rtgs.train.watch import CPU_SECONDS, PSNR, PSNR_MASKED
@@ -37,9 +38,9 @@ def write_time_quality(folder: Path, runs: Sequence[tuple[RunConfig, Sequence[St
     }
     written = []
     for name, text in texts.items():
-        temporary = folder / f"{name}.tmp"
-        temporary.write_text(text, encoding="utf-8")
-        written.append(temporary.replace(folder / name))
+        with whole_file(folder / name) as partial:
+            partial.write_text(text, encoding="utf-8")
+        written.append(folder / name)
     scenes = {one.scene.name: curve.scene for (one, _), curve in zip(trained, curves, strict=True)}
     for name, scene in scenes.items():
         written += draw_time_quality([curve for curve in curves if curve.scene == scene], folder / name)

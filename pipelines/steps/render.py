@@ -135,7 +135,10 @@ def render(params: RenderParams, context: StepContext) -> None:
         with torch.no_grad():
             start = time.perf_counter()
             rendered = method.render(view.camera, stage.until, Mode.EVALUATE, options, view.mask)
-            full = rendered.image if params.supersample == 1 else finer.full(view, RenderOptions())
+            full = rendered.image
+            if params.supersample > 1:  # the picture that counts; ``rendered`` is for its maps alone
+                start = time.perf_counter()
+                full = finer.full(view, RenderOptions())
             image = full
             if mixture is not None:
                 image = finer.mixed(view, full, RenderOptions())
@@ -161,7 +164,7 @@ def render(params: RenderParams, context: StepContext) -> None:
     if method.light is not None:
         frame = mean_frame(torch.stack([view.camera.rotation for view in scene.train]))
         save_environment(context.out / ENVIRONMENT, method.light, frame, _ENVIRONMENT_SIDE)
-    RenderTimes({**seconds}, params.maps).write(context.out)
+    RenderTimes({**seconds}, params.maps and params.supersample == 1).write(context.out)
     if seconds:
         context.log.info("rendered %d test views, %.3f s each", len(seconds), sum(seconds.values()) / len(seconds))
 

@@ -76,9 +76,18 @@ def _combinations(loader: ConfigLoaderImpl, master: DictConfig) -> list[list[str
     if sweeper.get("_target_") != _SWEEPER:
         raise RtgsError(f"hydra/sweeper {sweeper.get('_target_')}: only the jobs of Hydra's basic sweeper are known")
     swept = [f"{key}={value}" for key, value in (sweeper.params or {}).items()]
-    overrides = OverridesParser.create(config_loader=loader).parse_overrides([*swept, *master.hydra.overrides.task])
+    overrides = OverridesParser.create(config_loader=loader).parse_overrides([*swept, *_words(master)])
     (batch,) = BasicSweeper.split_arguments(overrides, None)
     return batch
+
+
+def _words(master: DictConfig) -> list[str]:
+    """As they were given: ``${...}`` in them is of the job's config, not of this one."""
+    from omegaconf import OmegaConf
+
+    words = OmegaConf.to_container(master.hydra.overrides.task, resolve=False)
+    assert isinstance(words, list)
+    return [str(word) for word in words]
 
 
 class _Composer:

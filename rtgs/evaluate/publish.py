@@ -189,7 +189,8 @@ def _published(methods: Sequence[str], scenes: Mapping[str, str]) -> dict[tuple[
     found: dict[tuple[str, str], PaperScore] = {}
     for scene, papers in scenes.items():
         found |= {(row, scene): score for row in methods if (score := paper_score(row, papers)) is not None}
-    ran, ablations = {paper_row(row) for row in methods}, any("," in row for row in methods)
+    ran = {paper_row(row) for row in methods}
+    ablations = any("," in row for row, _ in found)  # of the paper: a judged row is none
     for scene, papers in scenes.items():
         for row in paper_rows(papers, ablations=ablations):
             score = paper_score(row, papers)

@@ -35,6 +35,7 @@ from rtgs.train.seeds import generator_for
 from rtgs.train.settings import LossSettings, ScheduleSettings
 from rtgs.train.trainer import Trainer
 
+BAKE_VERSION = 1  # of what a fit gives: count it up when that changes
 SH_DEGREE = 3  # the most that viewers know
 MOST_BETWEEN = 100  # cameras between those of the training
 HELD_EVERY = 8  # of the cameras between, where a scene has no test views

@@ -165,9 +165,11 @@ def _receive(file: RemoteFile, part: Path, answer: http.client.HTTPResponse, hav
     tag = answer.headers.get("ETag", "")
     if tag.startswith("W/") or not tag:  # a weak one says nothing of bytes
         tag = answer.headers.get("Last-Modified", "")
-    _validator_file(part).write_text(tag, encoding="utf-8")
     done = start
+    if not start:  # never the new one beside old bytes
+        _validator_file(part).unlink(missing_ok=True)
     with part.open("r+b" if start else "wb") as stream:
+        _validator_file(part).write_text(tag, encoding="utf-8")
         stream.seek(start)
         while chunk := answer.read(_CHUNK):
             done += len(chunk)

@@ -16,6 +16,7 @@ from rtgs.render.pose import NUMBERS, moved
 from rtgs.train.losses import photometric_loss
 from rtgs.train.method import Mode, RenderOptions
 from rtgs.train.parameters import ParameterGroup, Rate
+from rtgs.train.terms import as_the_sensor
 
 if TYPE_CHECKING:
     from rtgs.methods.model import Model
@@ -39,6 +40,8 @@ def refine_pose(model: Model, view: View, step: int, *, steps: int) -> Camera:
         pose = moved(view.camera, group["delta"], model.extent)
         frame = Frame(pose.of(view.camera), step, Mode.EVALUATE, RenderOptions(), view.mask, pose)
         image = model.seen(frame).image
+        if model.loss.clipped:
+            image = as_the_sensor(image, view.image)
         loss = photometric_loss(image, view.image, model.loss.l1, model.loss.dssim).total
         if float(loss.detach()) < least:
             best, least = frame.camera, float(loss.detach())

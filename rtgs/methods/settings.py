@@ -216,7 +216,7 @@ class TransmittanceSettings:
     """The third stage: straight rays through transparent objects (method.md 3.3, 4.4, 6.2, 6.3).
 
     Of scenes with masks only. Boundaries are shares of the run, intervals are steps of the set's own clock, which
-    begins with the stage. The first choice of each key is this project's, the paper's way is named beside it.
+    begins with the stage. Recipes: conf/method/rtgs.yaml, and as the paper has it conf/method/rtgs_printed.yaml.
     """
 
     enabled: bool = True  # False: the run ends after the second stage
@@ -247,7 +247,7 @@ class TransmittanceSettings:
     # wall reflects there, with wall.light=fresnel (docs/glass_walls.md). 0: the pixel's centre speaks for all of it.
     rim_samples: int = field(default=0, metadata=UNLESS_DEFAULT)
     # Share of the masked pixels whose base depth is the object's first surface; with more the object is opaque and the
-    # stage left out (docs/lab/transmittance.md: thin glass 0.05 to 0.5). 1: never.
+    # stage left out (docs/lab/transmittance.md: thin glass 0.27 to 0.73). 1: never.
     opaque_share: float = 0.9
     # Base surfels in the object begin as its contents with an opacity of at most this, so that light can take the place
     # of those that stood for it (docs/lab/glass_light.md). 1: as they are.

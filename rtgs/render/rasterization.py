@@ -285,8 +285,13 @@ def _cameras(viewmats: Tensor, intrinsics: Tensor, width: int, height: int) -> l
             raise ValueError(f"viewmats[{index}] holds no rotation: its rows must be orthonormal (no scale, no shear)")
         if float(torch.linalg.det(rotation)) < 0:
             raise ValueError(f"viewmats[{index}] mirrors: its determinant is -1; x is right, y down, z forward")
+        if (bottom := view[3].tolist()) != [0, 0, 0, 1]:
+            raise ValueError(f"viewmats[{index}] has the bottom row {bottom}: it must be 0, 0, 0, 1")
+        if (last := lens[2].tolist()) != [0, 0, 1]:
+            raise ValueError(f"Ks[{index}] has the last row {last}: it must be 0, 0, 1")
         if lens[0, 1] != 0 or lens[1, 0] != 0:
-            raise ValueError(f"Ks[{index}] has skew {float(lens[0, 1])}: pinhole cameras without skew are rendered")
+            skew = float(lens[0, 1] if lens[0, 1] != 0 else lens[1, 0])
+            raise ValueError(f"Ks[{index}] has skew {skew}: pinhole cameras without skew are rendered")
         (fx, _, cx), (_, fy, cy), _ = lens.tolist()
         found.append(Camera(rotation, view[:3, 3], fx, fy, cx, cy, width, height, f"viewmats[{index}]"))
     return found

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from rtgs.core.errors import RtgsError
+from rtgs.core.files import whole_file
 
 REACHES = ()  # whether a codec is there; no step's result depends on it
 
@@ -47,7 +48,10 @@ def write_mp4(path: Path, frames: Iterable[np.ndarray], rate: int) -> None:
         raise RtgsError(NEEDS_AV) from error
     first, frames = _first(frames)
     height, width = (side + side % 2 for side in first.shape[:2])
-    with av.open(str(path), "w", options={"movflags": "faststart"}) as container:
+    with (
+        whole_file(path) as partial,
+        av.open(str(partial), "w", format="mp4", options={"movflags": "faststart"}) as container,
+    ):
         try:
             stream = container.add_stream("libx264", rate=Fraction(rate), options={"crf": CRF})
         except ValueError as error:  # of av: no such codec
@@ -74,15 +78,16 @@ def write_preview(path: Path, frames: Sequence[np.ndarray], rate: int, most: int
     first, _ = _first(frames)
     height, width = first.shape[:2]
     size = 0
-    for long_side, quality in WEBP_STEPS:
-        share = min(1.0, long_side / max(height, width))
-        sides = max(1, round(width * share)), max(1, round(height * share))
-        start, *others = (Image.fromarray(frame).resize(sides, Image.Resampling.BOX) for frame in frames)
-        more = {"save_all": True, "append_images": others, "duration": round(1000 / rate), "loop": 0}
-        start.save(path, "WEBP", quality=quality, **more)
-        size = path.stat().st_size
-        if size <= most:
-            break
+    with whole_file(path) as partial:
+        for long_side, quality in WEBP_STEPS:
+            share = min(1.0, long_side / max(height, width))
+            sides = max(1, round(width * share)), max(1, round(height * share))
+            start, *others = (Image.fromarray(frame).resize(sides, Image.Resampling.BOX) for frame in frames)
+            more = {"save_all": True, "append_images": others, "duration": round(1000 / rate), "loop": 0}
+            start.save(partial, "WEBP", quality=quality, **more)
+            size = partial.stat().st_size
+            if size <= most:
+                break
     return size
 
 

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from rtgs.core.cameras import Camera
 from rtgs.core.errors import RtgsError
+from rtgs.core.files import whole_file
 from rtgs.core.refuse import refuse_unknown, refuse_unless
 from rtgs.evaluate.images import error_map, to_bytes
 from rtgs.evaluate.layers import added_by_base
@@ -195,6 +196,7 @@ def save_figure(figure: Figure, path: Path) -> tuple[Path, ...]:
     written = []
     for suffix, metadata in ((".png", {"Software": None}), (".pdf", {"CreationDate": None, "Producer": None})):
         target = path.with_name(f"{path.name}{suffix}")
-        figure.savefig(target, dpi=_DPI, metadata=metadata)
+        with whole_file(target) as partial:
+            figure.savefig(partial, format=suffix[1:], dpi=_DPI, metadata=metadata)
         written.append(target)
     return tuple(written)

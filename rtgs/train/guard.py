@@ -19,7 +19,7 @@ SHOWN = 5
 
 @dataclass(frozen=True)
 class BadGaussians:
-    """Surfels with a non-finite gradient or parameter."""
+    """Gaussians, or rows of a group of parameters, with a gradient or value that is not finite."""
 
     set_name: str
     tensor: str  # "gradient of log_scales" or "log_scales"

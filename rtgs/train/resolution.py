@@ -35,7 +35,7 @@ def spectrum_shares(views: Sequence[View], largest: int) -> tuple[float, ...]:
         rows, columns = (np.abs(np.fft.fftfreq(count)) for count in gray.shape)  # in 0..1/2
         reach = np.maximum(rows[:, None], columns[None, :])
         held += [magnitude[reach <= 0.5 / factor].sum() for factor in range(1, largest + 1)]
-    return tuple(held / held[0])
+    return tuple(held / held[0]) if held[0] > 0 else (1.0,) * largest  # black photos: nothing is lost
 
 
 def factor_starts(shares: Sequence[float], until: int) -> tuple[tuple[int, int], ...]:

@@ -184,7 +184,9 @@ class ViserPage:
 
     def _chosen(self, _event: object = None) -> None:
         """Something was switched."""
-        weights = ((name, slider.value if switch.value else 0.0) for name, (switch, slider) in self._weights.items())
+        weights = (
+            (name, slider.value if switch.value else 0.0) for name, (switch, slider) in list(self._weights.items())
+        )
         told = tuple((name, float(weight)) for name, weight in weights if weight != 1)
         self._choice = Choice(self._shown.value, told, self.around.visible)
         self.woken.set()

@@ -27,6 +27,14 @@ def test_a_job_is_what_hydra_composes_for_its_words(words):
         assert (job.config, job.choices) == (config, choices)
 
 
+def test_what_a_word_takes_from_the_config_is_of_its_job():
+    jobs, _ = compose_jobs(
+        ["scene=fox,sedan", "method=external", "external.name=n", "external.renders=/x/${scene.name}"], multirun=True
+    )
+    found = [job.config.external.renders for job in jobs if job.config is not None]
+    assert found == ["/x/fox", "/x/sedan"]
+
+
 def test_jobs_come_in_hydras_order():
     jobs, _ = compose_jobs(["seed=0,1", "scene=fox,sedan"], multirun=True)
     assert [job.title for job in jobs] == [

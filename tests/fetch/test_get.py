@@ -7,6 +7,7 @@ import hashlib
 import http.server
 import io
 import json
+import socket
 import stat
 import threading
 import zipfile
@@ -186,8 +187,13 @@ def test_a_missing_file_is_told_at_once(site, tmp_path):
     assert len(site.asked) == 1
 
 
-def test_offline_is_said_with_what_to_do(tmp_path):
-    nobody = RemoteFile("a.jpg", "http://127.0.0.1:9/a.jpg", 1, None, 1)
+def test_offline_is_said_with_what_to_do(site, tmp_path):
+    with socket.socket() as deaf:  # bound, but nobody listens
+        deaf.bind(("127.0.0.1", 0))
+        _refused(RemoteFile("a.jpg", f"http://127.0.0.1:{deaf.getsockname()[1]}/a.jpg", 1, None, 1), tmp_path)
+
+
+def _refused(nobody: RemoteFile, tmp_path: Path) -> None:
     capture = Capture("far", "far away", "none", "https://example.org/far", (nobody,))
     with pytest.raises(NotReached, match=r"Is this machine offline.*the same command goes on.*example\.org/far"):
         get_capture(capture, tmp_path, print, plain=True, pause=0.0)

@@ -25,6 +25,7 @@ from rtgs.methods import Mode, RenderOptions, create_method, find_method
 from rtgs.methods.model import Model
 from rtgs.methods.parts.feature_light import NETWORK
 from rtgs.methods.parts.feature_mirror import ALBEDO, FEATURE, OUTSIDE, ROUGHNESS, SH_IMAGE, FeatureMirror
+from rtgs.methods.photo_settings import AppearanceSettings
 from rtgs.methods.ref_gs import FeatureSettings
 from rtgs.methods.settings import MethodSettings
 from rtgs.methods.shading.feature_light import INPUTS, first_weights, light_of, mirrored_light
@@ -187,6 +188,44 @@ def test_weights_of_inside_and_outside_are_constants_and_the_outside_has_a_loss_
     entropy = -(opacity * opacity.log() + (1 - opacity) * (1 - opacity).log()).mean()
     assert terms["opacity_entropy"].value == pytest.approx(float(entropy), rel=1e-4)
     assert torch.autograd.gradcheck(opacity_entropy, (0.1 + 0.8 * opacity[:9]).requires_grad_())
+
+
+@pytest.mark.parametrize("own", [{}, SPHERE])
+def test_a_background_is_seen_where_nothing_is(own: dict):
+    made = tiny()
+    asked = settings(**own)
+    asked = replace(asked, render=replace(asked.render, background=(1.0, 0.5, 0.25)))
+    method = new_method(asked, made, schedule())
+    for stage in method.stages:
+        method.begin(stage)
+    camera = made.scene.test[0].camera
+    with torch.no_grad():
+        before = method.render(camera, 30, Mode.EVALUATE)
+        clear = (1 - before.buffers.alpha) * torch.tensor((1.0, 0.5, 0.25))[:, None, None]
+        black = new_method(settings(**own), made, schedule())
+        for stage in black.stages:
+            black.begin(stage)
+        black.load({name: tensor.clone() for name, tensor in method.state().items()})
+        torch.testing.assert_close(before.image, black.render(camera, 30, Mode.EVALUATE).image + clear)
+        method["base"].gaussians.opacity_logits.fill_(-12.0)
+        image = method.render(camera, 30, Mode.EVALUATE).image
+    torch.testing.assert_close(image.mean((1, 2)), torch.tensor((1.0, 0.5, 0.25)), atol=1e-3, rtol=0)
+
+
+def test_what_is_outside_of_the_sphere_is_exposed_as_the_photo_is():
+    made = tiny()
+    views = [replace(view, camera=replace(view.camera, name=str(k))) for k, view in enumerate(made.scene.train)]
+    made = replace(made, scene=replace(made.scene, train=tuple(views)))
+    asked = replace(settings(**SPHERE), appearance=AppearanceSettings(enabled=True))
+    method = new_method(asked, made, schedule())
+    for stage in method.stages:
+        method.begin(stage)
+    view = made.scene.train[0]
+    with torch.no_grad():
+        plain = method.render(view.camera, 30, Mode.TRAIN).maps[SH_IMAGE]
+        group = next(group for group in method.groups if "stops" in group)
+        group["stops"].fill_(1.0)
+        torch.testing.assert_close(method.render(view.camera, 30, Mode.TRAIN).maps[SH_IMAGE], 2 * plain)
 
 
 def test_features_start_from_noise_and_the_published_start_is_a_key():

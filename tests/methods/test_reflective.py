@@ -236,6 +236,7 @@ def test_state_goes_round_in_the_middle_of_the_second_stage(traced: TracedShareS
 
 SCRIPT = """
 import sys
+import time
 from pathlib import Path
 import torch
 from reflective_cases import SAMPLED, new_method, recipe, schedule, tiny
@@ -253,6 +254,7 @@ for stage in method.stages:
     method.after_step = telling
     trainer.run()
     method.after_step = after_step
+time.sleep(600)  # until it is killed
 """
 
 

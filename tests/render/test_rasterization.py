@@ -241,6 +241,13 @@ def test_what_would_be_rendered_wrongly_is_refused_by_name(function) -> None:
     views, _ = matrices(cameras())
     mirrored = views @ torch.diag(torch.tensor([1.0, 1.0, -1.0, 1.0])).to(views)
     refused(r"viewmats\[0\] mirrors", function, viewmats=mirrored)
+    _, lenses = matrices(cameras())
+    doubled, skewed, bottom = 2 * lenses, lenses.clone(), views.clone()
+    skewed[:, 1, 0] = 3.0
+    bottom[:, 3, 3] = 2.0
+    refused(r"Ks\[0\] has the last row \[0.0, 0.0, 2.0\]", function, Ks=doubled)
+    refused(r"Ks\[0\] has skew 3.0", function, Ks=skewed)
+    refused(r"viewmats\[0\] has the bottom row", function, viewmats=bottom)
     refused(r"width=32\.0 must be a whole number", function, width=32.0)
     refused(r"height=0 must be", function, height=0)
     refused(r"width=True must be", function, width=True)

@@ -27,6 +27,14 @@ def test_a_picture_without_detail_is_held_by_small_ones_and_noise_by_its_area():
     assert spectrum_shares([fine], 2)[1] < 0.9
 
 
+def test_black_photos_hold_all_they_have():
+    (view,) = small_scene().train[:1]
+    black = replace(view, image=torch.zeros_like(view.image))
+    shares = spectrum_shares([black, black], 3)
+    assert shares == (1.0, 1.0, 1.0)
+    assert factor_starts(shares, 100) == ((0, 1),)
+
+
 def test_sizes_begin_where_the_logarithm_of_what_they_hold_is_due():
     shares = [1.0, 0.8, 0.4, 0.2]  # the last holds less than a quarter
     whole = math.log(1 / 0.4)

@@ -27,6 +27,7 @@ ROOT = Path(__file__).parents[2]
 SCRIPT = """
 import os, signal, sys
 from pathlib import Path
+import time
 import torch
 from rtgs.train import checkpoint
 from training_cases import small_schedule, small_trainer
@@ -55,6 +56,8 @@ def telling(step, observations):
 
 trainer.method.after_step = telling
 print("resumed", trainer.run().resumed_from, flush=True)
+if left <= 0:
+    time.sleep(600)  # until it is killed
 """
 
 

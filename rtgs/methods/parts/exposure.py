@@ -16,6 +16,7 @@ from torch.nn.functional import smooth_l1_loss
 
 from rtgs.core.decisions import Decision
 from rtgs.core.errors import RtgsError
+from rtgs.methods.parts.feature_mirror import SH_IMAGE
 from rtgs.methods.parts.part import Frame, Part
 from rtgs.train.method import RenderedView
 from rtgs.train.parameters import ParameterGroup, Rate
@@ -64,7 +65,11 @@ class Exposure(Part):
         row = self.rows.get(frame.camera.name)
         if row is None:
             return shaded
-        return replace(shaded, image=exposed(shaded.image, self.group["stops"][row], self.group["colors"][row]))
+        stops, colors = self.group["stops"][row], self.group["colors"][row]
+        maps = dict(shaded.maps)
+        if SH_IMAGE in maps:  # a loss of its own compares it with the photo
+            maps[SH_IMAGE] = exposed(maps[SH_IMAGE], stops, colors)
+        return replace(shaded, image=exposed(shaded.image, stops, colors), maps=maps)
 
     def terms(self) -> Iterator[LossTerm]:
         """What holds the means over all photos, which the set's own colours could take up."""

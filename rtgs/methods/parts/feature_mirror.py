@@ -126,9 +126,13 @@ class FeatureMirror(Part):
         found = light.linear(rays.directions, roughness, feature.T).T
         shape = (3, camera.height, camera.width)
         shown = torch.zeros_like(flat[:3]).index_copy(1, chosen, encoded(albedo + found, "linear"))
-        kept = flat[:3] if scoped else flat[:3].detach()
-        image = (inside * shown + outside * kept).reshape(shape)
-        maps = {SH_IMAGE: kept.reshape(shape), OUTSIDE: outside.reshape(shape[1:])} if scoped else {}
+        colors = flat[:3] if scoped else flat[:3].detach()
+        background = torch.tensor(self.settings.render.background)[:, None]
+        clear = (1 - alpha) * background  # in ``colors`` already, and seen beside both shares
+        kept = colors - clear.detach() if bool(background.any()) else colors
+        image = inside * shown + outside * kept
+        image = (image + clear if bool(background.any()) else image).reshape(shape)
+        maps = {SH_IMAGE: colors.reshape(shape), OUTSIDE: outside.reshape(shape[1:])} if scoped else {}
         layers = None
         if frame.options.layers:
             layers = _layers(shape, inside.detach(), (outside * kept).detach(), chosen, albedo.detach(), found.detach())

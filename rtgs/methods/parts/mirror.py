@@ -147,7 +147,7 @@ class Mirror(Part):
         if self.far is not None:
             self.far.begin()
         if settings.init_from == "base":
-            copied = copied_surfels(self.base.set.gaussians, settings.density.max_surfels, settings.init.sh_degree)
+            copied = copied_surfels(self.base.set.shown(), settings.density.max_surfels, settings.init.sh_degree)
             self._adopt(copied)
             yield StepEvent("begin", "reflection", f"{len(copied)} surfels of the base set")
             return

@@ -368,11 +368,21 @@ def test_an_instruction_set_that_is_misspelled_stops_a_run_before_any_step(first
     assert sorted((root / "store").rglob("manifest.json")) == before
 
 
+STOPS_AT_A_CHECKPOINT = """
+import sys, time
+from rtgs.train import trainer
+save = trainer.save_checkpoint
+trainer.save_checkpoint = lambda *given: (save(*given), time.sleep(600))
+from pipelines.cli.main import main
+main(sys.argv[1:])
+"""
+
+
 def test_a_killed_training_goes_on_and_ends_the_same(words, first, root, tmp_path, monkeypatch, capsys):
     longer = [*words, "schedule.total=200", "schedule.checkpoint_every=20", "name=long"]
     assert main(longer) == 0
     monkeypatch.setenv("RTGS_ROOT", str(tmp_path))
-    process = subprocess.Popen([sys.executable, "-m", "rtgs", *longer], start_new_session=True)
+    process = subprocess.Popen([sys.executable, "-c", STOPS_AT_A_CHECKPOINT, *longer], start_new_session=True)
     end = time.monotonic() + 120
     while not list(tmp_path.glob("store/train_diffuse/partial/*/checkpoints/step_*")):
         assert process.poll() is None

@@ -66,6 +66,21 @@ def test_an_error_raised_from_the_signal_leaves_as_the_signal():
         step()
 
 
+def test_a_signal_that_python_drops_comes_again():
+    class Dropping:
+        def __del__(self) -> None:
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(0.01)
+
+    def wait() -> None:
+        found = Dropping()
+        del found
+        time.sleep(20)
+
+    with pytest.raises(Terminated), sigterm_raises():
+        wait()
+
+
 def test_other_errors_leave_as_they_are():
     with pytest.raises(ValueError, match="its own"), sigterm_raises():
         raise ValueError("its own")
@@ -109,7 +124,10 @@ def test_a_terminated_training_says_so_and_leaves_no_temporary_folder(root, capt
     process = subprocess.Popen(command, env=environment, cwd=root, **pipes)
     _wait_for(lambda: any((root / "store").rglob("*.safetensors")), process)  # a checkpoint: it trains
     process.send_signal(signal.SIGTERM)
-    _, said = process.communicate(timeout=_PATIENCE)
+    try:
+        _, said = process.communicate(timeout=_PATIENCE)
+    finally:
+        process.kill()
     assert process.returncode == EXIT_CODE == 143, said
     assert "terminated; the same command goes on from the last checkpoint" in said
     assert "stack trace" not in said

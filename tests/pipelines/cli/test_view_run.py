@@ -8,7 +8,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -176,8 +175,12 @@ def test_a_training_is_stopped_from_the_browser_and_goes_on_later(root, capture,
 
 
 def test_a_run_is_shown_with_its_layers_until_its_page_is_closed(run):
-    page = FakePage()
-    threading.Timer(0.5, lambda: setattr(page, "stopped", True)).start()
+    class Closed(FakePage):
+        def tell(self, text: str) -> None:
+            super().tell(text)
+            self.stopped = len(self.seats[0].pictures) > 1
+
+    page = Closed()
     show(open_run(run), page, 0)  # type: ignore[arg-type]
     assert page.kinds == ("final", "diffuse", "reflection", "normal", "depth", "weights")
     assert "step 12" in page.told[-1]
