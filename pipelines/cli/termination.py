@@ -67,7 +67,9 @@ def serve_until_interrupted(command: Sequence[str], environment: Mapping[str, st
 
     None of them outlives this function.
     """
-    before = signal.getsignal(signal.SIGTERM)
+    main_thread, before = threading.current_thread() is threading.main_thread(), signal.getsignal(signal.SIGTERM)
+    if main_thread:
+        signal.signal(signal.SIGTERM, _terminate_once)
     server = subprocess.Popen(command, env=dict(environment), start_new_session=True)
     try:
         return server.wait()
@@ -75,14 +77,18 @@ def serve_until_interrupted(command: Sequence[str], environment: Mapping[str, st
         return 0
     finally:
         _end_all(server)
-        if threading.current_thread() is threading.main_thread():
+        if main_thread:
             signal.signal(signal.SIGTERM, before)
 
 
+def _terminate_once(number: int, frame: FrameType | None) -> None:
+    """A second signal must not end this process before the server's."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    raise Terminated
+
+
 def _end_all(server: subprocess.Popen[bytes]) -> None:
-    """End the group of a process that leads one: politely, then not. Another SIGTERM to this one does not stop that."""
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    """End the group of a process that leads one: politely, then not."""
     with suppress(ProcessLookupError):
         os.killpg(server.pid, signal.SIGTERM)
     with suppress(subprocess.TimeoutExpired, KeyboardInterrupt):

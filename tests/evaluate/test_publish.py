@@ -261,6 +261,15 @@ def test_every_published_row_stands_beside_what_was_run_in_columns_of_its_own(tm
     assert all("15.14 / 0.660 / 0.479" in texts[suffix] for suffix in (".md", ".tex", ".html"))
 
 
+def test_a_judged_row_is_no_ablation():
+    rows = [
+        {row for row, _ in build_table(STAND_IN, [run(label, "ball_statue", 28.0)]).published}
+        for label in ("rtgs", "rtgs, judged")
+    ]
+    assert "envgs" in rows[0] & rows[1]
+    assert not {"rtgs, no_depth_loss"} & (rows[0] | rows[1])
+
+
 def test_a_table_of_ablations_has_the_papers_ablations_alone():
     runs = [run("rtgs", "ball_statue", 28.0), run("rtgs, no_depth_loss", "ball_statue", 27.0)]
     table = build_table(STAND_IN, runs)

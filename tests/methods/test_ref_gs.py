@@ -23,6 +23,7 @@ from rtgs.light.pictures import save_environment
 from rtgs.light.settings import EnvironmentSettings
 from rtgs.methods import Mode, RenderOptions, create_method, find_method
 from rtgs.methods.model import Model
+from rtgs.methods.parts.exposure import Exposure
 from rtgs.methods.parts.feature_light import NETWORK
 from rtgs.methods.parts.feature_mirror import ALBEDO, FEATURE, OUTSIDE, ROUGHNESS, SH_IMAGE, FeatureMirror
 from rtgs.methods.photo_settings import AppearanceSettings
@@ -223,7 +224,7 @@ def test_what_is_outside_of_the_sphere_is_exposed_as_the_photo_is():
     view = made.scene.train[0]
     with torch.no_grad():
         plain = method.render(view.camera, 30, Mode.TRAIN).maps[SH_IMAGE]
-        group = next(group for group in method.groups if "stops" in group)
+        group = next(group for group in method.groups if group.name == Exposure.name)
         group["stops"].fill_(1.0)
         torch.testing.assert_close(method.render(view.camera, 30, Mode.TRAIN).maps[SH_IMAGE], 2 * plain)
 

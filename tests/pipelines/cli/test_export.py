@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import plyfile
@@ -13,9 +14,9 @@ import torch
 
 from pipelines.cli.export import ExportWords, parse_words
 from pipelines.cli.main import main
-from pipelines.publishing.exported_run import export_run
+from pipelines.publishing.exported_run import BakeRecord, export_run
 from rtgs.core.errors import RtgsError
-from rtgs.export.bake import BakeSettings
+from rtgs.export.bake import BAKE_VERSION, BakeSettings
 from rtgs.gaussians.ply import read_gaussians
 from rtgs.report.files import BEGIN, END
 from rtgs.runs.shown import open_run
@@ -72,6 +73,13 @@ def test_the_fit_is_kept_until_the_words_or_the_file_change(layered):
     again = export_run(run, BakeSettings(steps=5, most=30), out)
     assert again.record == other.record
     assert torch.equal(again.splats.means, other.splats.means)
+
+
+def test_a_fit_of_another_version_is_made_again():
+    wanted = BakeRecord({"train_diffuse": "a"}, 5, 0, version=BAKE_VERSION)
+    assert replace(wanted, sha256="b", psnr=20.0).fits(wanted)
+    for other in ({"version": 0}, {"steps": 6}, {"most": 9}, {"clear": True}, {"trained": {}}):
+        assert not replace(wanted, **other).fits(wanted)
 
 
 def test_a_plain_model_is_written_as_it_is(plain, capsys):

@@ -54,6 +54,15 @@ def test_frames_and_films_of_every_layer(run, capsys):
     assert sorted(path.name for path in out.iterdir()) == ["film.mp4", "frames", "preview.webp"]
 
 
+def test_a_folder_of_other_frames_is_left_alone(run, tmp_path, capsys):
+    photo = tmp_path / "film" / "frames" / "IMG_1.jpg"
+    photo.parent.mkdir(parents=True)
+    photo.write_bytes(b"the only copy")
+    assert main(["show", "mirror", "frames=1", "format=png", f"out={tmp_path / 'film'}", "threads=1"]) == 1
+    assert f"{photo} is no frame of a film" in capsys.readouterr().err
+    assert photo.read_bytes() == b"the only copy"
+
+
 def test_a_photos_camera_sees_what_the_run_rendered(run):
     """From the place of a test view, given as a camera path, the picture is the one of the run."""
     shown = open_run(run)

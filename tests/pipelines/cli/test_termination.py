@@ -86,6 +86,28 @@ def test_other_errors_leave_as_they_are():
         raise ValueError("its own")
 
 
+def test_a_second_signal_does_not_leave_the_server_behind(tmp_path):
+    server = (
+        "import os, signal, sys, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); from pathlib import Path;"
+        "Path(sys.argv[1] + '.new').write_text(str(os.getpid())); Path(sys.argv[1] + '.new').rename(sys.argv[1]);"
+        "time.sleep(600)"
+    )
+    code = (
+        "import os, sys; from pipelines.cli import termination; termination._GRACE_SECONDS = 1.0\n"
+        "with termination.sigterm_raises():\n"
+        "    sys.exit(termination.serve_until_interrupted([sys.executable, '-c', *sys.argv[1:]], os.environ))"
+    )
+    place = tmp_path / "pid"
+    process = subprocess.Popen([sys.executable, "-c", code, server, str(place)], stderr=subprocess.PIPE, text=True)
+    _wait_for(place.exists, process)
+    process.send_signal(signal.SIGTERM)
+    for _ in range(8):
+        time.sleep(0.1)
+        process.send_signal(signal.SIGTERM)
+    process.communicate(timeout=_PATIENCE)
+    assert not _alive(int(place.read_text()))
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_a_server_ends_with_all_its_processes(tmp_path):
     """The server leaves the signal to a process of its own, as MLflow does, and both ignore it."""

@@ -50,6 +50,25 @@ def test_a_run_of_an_older_version_keeps_its_folder(tmp_path):
     assert with_own_name(*one).name == "kitchen-2dgs-quick"
 
 
+def test_films_and_exports_of_the_model_before_are_put_aside(root, capture, capsys):
+    words = ["run", f"scene={capture}", "method=2dgs", *QUICK, "name=twice"]
+    assert main([*words, "seed=1"]) == 0
+    folder = root / "runs" / "twice"
+    for place in ("exports/twice.ply", "shown/orbit-final/film.mp4"):
+        (folder / place).parent.mkdir(parents=True)
+        (folder / place).write_text("first")
+    assert main([*words, "seed=1"]) == 0
+    assert (folder / "exports" / "twice.ply").is_file(), "the same model"
+    capsys.readouterr()
+    assert main([*words, "seed=2"]) == 0
+    left = (path for path in folder.rglob("*") if path.suffix in (".ply", ".mp4"))
+    assert sorted(path.relative_to(folder).as_posix() for path in left) == [
+        *("before/exports/twice.ply", "before/shown/orbit-final/film.mp4", "point_cloud.ply"),
+    ]
+    assert "exports are of the model before: now in" in capsys.readouterr().err
+    assert "twice.ply" not in (folder / "report.html").read_text(encoding="utf-8")
+
+
 def test_what_is_replaced_is_told():
     before = RunRecord("a", "rtgs run seed=1", "2026", {}, {})
     assert "showed another run" in replaced(Path("runs/a"), before, "rtgs run seed=2")
