@@ -70,7 +70,7 @@ def test_words_without_a_secret_are_left_alone(monkeypatch):
     assert "RTGS_TRACKING_URI" not in os.environ
 
 
-@pytest.mark.parametrize("password", ["pa'ss", 'pa"ss', "pa ss", "p a'' s\\s", "pa/ss@x", "12/pa'ss"])
+@pytest.mark.parametrize("password", ["pa'ss", "12345678", 'pa"ss', "pa ss", "p a'' s\\s", "pa/ss@x", "12/pa'ss"])
 def test_passwords_with_any_signs_go_to_the_environment_and_are_hidden_in_every_text(password: str, monkeypatch):
     monkeypatch.setenv("RTGS_TRACKING_URI", "")
     uri = f"postgresql://me:{password}@host/db"
@@ -96,6 +96,8 @@ def test_secrets_of_a_known_address_are_hidden_wherever_they_stand(monkeypatch):
     hide("s3://me:long secret%21@host/x?token=it's secret&b=1")
     assert redact(text) == "password '***' of me is wrong; *** too, oblong secret! not"
     assert redact("s3://host/x?token=it's secret&b=1") == "s3://host/x?token=***&b=1"
+    hide("ftp://me:eightone@host")
+    assert redact("is eightone it?") == "is *** it?"
     hide("ftp://me:run@host")  # short: a word of any text
     assert redact("rtgs run me:run@host") == "rtgs run ***@host"
     hide("http://host:5000")

@@ -7,6 +7,7 @@ import hashlib
 import http.server
 import io
 import json
+import shutil
 import socket
 import stat
 import threading
@@ -199,6 +200,15 @@ def _refused(nobody: RemoteFile, tmp_path: Path) -> None:
         get_capture(capture, tmp_path, print, plain=True, pause=0.0)
 
 
+def test_a_full_disk_is_told_before_anything_is_brought(site, tmp_path, monkeypatch):
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: usage._replace(free=len(PHOTO)))
+    capture = Capture("full", "", "none", "page", (site.file("a.jpg"),))
+    with pytest.raises(RtgsError, match=r"has 1 MB free, .* are needed: name a to="):
+        get_capture(capture, tmp_path, print, plain=True, pause=0.0)
+    assert site.asked == []
+
+
 # ---- captures
 
 
@@ -348,6 +358,18 @@ def test_an_archive_whose_header_lies_is_stopped_as_it_is_unpacked(tmp_path):
     with pytest.raises(RtgsError):
         unpack(tmp_path / "bad.zip", tmp_path / "set", Limits(bytes=100_000))
     assert names(tmp_path) == ["bad.zip"]
+
+
+def test_members_count_together_as_they_are_unpacked(tmp_path):
+    content = bytearray(zipped(("one", bytes(700_000)), ("two", bytes(700_000))))
+    at = content.find(b"PK\x01\x02")
+    while at >= 0:  # the directory promises little of each
+        content[at + 24 : at + 28] = (1000).to_bytes(4, "little")
+        at = content.find(b"PK\x01\x02", at + 4)
+    (tmp_path / "a.zip").write_bytes(content)
+    with pytest.raises(RtgsError):
+        unpack(tmp_path / "a.zip", tmp_path / "set", Limits(bytes=1_000_000))
+    assert names(tmp_path) == ["a.zip"]
 
 
 def test_a_cut_archive_is_refused(tmp_path):

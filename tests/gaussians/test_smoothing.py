@@ -35,6 +35,11 @@ def test_the_closest_sampling_counts():
     assert sampling_intervals(means, [camera(20), camera(50, 3.95)], NEAR).item() == pytest.approx(4 / 20)
 
 
+def test_the_finer_side_of_a_pixel_counts():
+    tall = replace(camera(20), fy=50.0)
+    assert sampling_intervals(torch.tensor([[0.0, 0.0, 4.0]]), [tall], NEAR).item() == pytest.approx(4 / 50)
+
+
 def test_what_no_camera_frames_has_the_largest_interval_of_the_others():
     means = torch.tensor([[0.0, 0.0, 4.0], [0.0, 0.0, 8.0], [0.0, 0.0, -5.0], [90.0, 0.0, 4.0]])
     intervals = sampling_intervals(means, [camera(20)], NEAR)

@@ -14,12 +14,13 @@ from training_cases import small_scene, small_trainer
 from rtgs.core.errors import RtgsError
 from rtgs.evaluate.metrics import cc_psnr
 from rtgs.gaussians.ply import write_ply
-from rtgs.methods import Mode
+from rtgs.methods import Mode, create_method
 from rtgs.methods.parts.exposure import exposed, rows_by_name
 from rtgs.methods.photo_settings import AppearanceSettings
 from rtgs.scenes.scene import Scene
 from rtgs.train.checkpoint import checkpoint_path
 from rtgs.train.guard import TrainingDiverged
+from rtgs.train.seeds import generator_for
 
 FAST = AppearanceSettings(enabled=True, rate=0.05, rate_end=5e-4)
 TOTAL = 300
@@ -76,6 +77,20 @@ def test_the_means_over_the_photos_are_held():
         means[weight] = abs(float(trainer.method.groups[0]["stops"].detach().mean()))  # type: ignore[index]
     assert means[1.0] < 0.02
     assert means[0.0] > 3 * means[1.0]
+
+
+def test_the_penalties_are_sums_over_all_numbers():
+    scene = photographed("3dgs", views=3)
+    method = create_method(replace(plain("3dgs"), appearance=FAST), scene, steady(20), generator_for(0, "initialise"))
+    group = next(group for group in method.groups if group.name == "exposure")
+    with torch.no_grad():
+        group["stops"].fill_(0.5)
+        group["colors"].fill_(0.2)
+    view = scene.train[0]
+    terms = method.losses(method.render(view.camera, 0, Mode.TRAIN), view, 0).terms
+    found = {term.name: float(term.value) for term in terms}
+    assert found["exposure"] == pytest.approx(0.5 - 0.05)  # beyond beta = .1: |x| - beta / 2
+    assert found["tint"] == pytest.approx(9 * (0.2 - 0.05))
 
 
 @pytest.mark.parametrize("what", ["appearance", "poses"])

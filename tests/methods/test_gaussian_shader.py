@@ -213,6 +213,8 @@ def test_the_published_mix_up_of_rates_is_a_key():
         assert back == pytest.approx(0.005)
         assert front == pytest.approx(0.016 if shared else 0.005)
         assert rates[BASE_COLOR] == pytest.approx(0.016 if shared else 0.01)
+        for name in (TINT, ROUGHNESS, "sh_dc", "sh_rest"):
+            assert rates[name] == rates[BASE_COLOR] or not shared, name
         assert rates["means"] < 0.016
         method["base"].densify(generator_for(0, "initialise"))
         assert method["base"].optimizer.learning_rates(30)[FRONT_RESIDUAL] == front

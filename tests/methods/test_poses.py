@@ -15,6 +15,7 @@ from rtgs.core.cameras import Camera
 from rtgs.core.errors import RtgsError
 from rtgs.gaussians.surfels import Surfels, activate
 from rtgs.methods import Mode, RenderOptions
+from rtgs.methods import refine_pose as refine_pose_module
 from rtgs.methods.parts.part import Frame
 from rtgs.methods.photo_settings import PoseSettings
 from rtgs.methods.refine_pose import refine_pose
@@ -24,6 +25,7 @@ from rtgs.render.pose import NUMBERS, Pose, moved, seen_from
 from rtgs.render.reference import surfels as reference
 from rtgs.scenes.scene import Scene
 from rtgs.train.losses import surface_depth
+from rtgs.train.parameters import Rate
 from rtgs.train.trainer import Trainer
 
 TOTAL = 400
@@ -92,6 +94,24 @@ def test_no_step_that_helps_leaves_the_pose():
     found = refine_pose(trainer.method, exact, 0, steps=3)  # type: ignore[arg-type]
     assert torch.equal(found.rotation, camera.rotation)
     assert torch.equal(found.translation, camera.translation)
+
+
+def test_of_the_poses_met_on_the_way_the_best_is_kept(monkeypatch):
+    """Steps that are far too long lead away from a photo that no pose shows."""
+    scene = photographed("2dgs", views=5)
+    trainer = small_trainer(scene, plain("2dgs"), steady(10))
+    camera = scene.test[0].camera
+
+    def image_from(camera):
+        with torch.no_grad():
+            return trainer.method.render(camera, 0, Mode.EVALUATE).image
+
+    noise = 0.05 * torch.randn(scene.test[0].image.shape, generator=torch.Generator().manual_seed(0))
+    noisy = replace(scene.test[0], image=(image_from(camera) + noise).clamp(0, 1))
+    monkeypatch.setattr(refine_pose_module, "RATE", Rate(0.2))
+    found = refine_pose(trainer.method, noisy, 0, steps=4)  # type: ignore[arg-type]
+    errors = [float((image_from(each) - noisy.image).abs().mean()) for each in (found, camera)]
+    assert errors[0] <= errors[1] * 1.001
 
 
 def test_the_gradient_of_the_losses_on_surfaces_is_that_of_finite_differences():

@@ -66,6 +66,16 @@ def test_a_shrunk_view_is_the_mean_over_its_pixels_and_frames_the_same():
         assert ((lengths - 1).abs() < 1e-5).logical_or(lengths == 0).all()
 
 
+def test_a_shrunk_mask_holds_where_most_of_a_pixel_does():
+    view = small_scene().train[0]
+    rows, columns = (torch.arange(size) for size in view.image.shape[1:])
+    mask = ((rows[:, None] % 2 == 0) & (columns % 2 == 0)) | (columns >= 16) & (rows[:, None] + columns > 0)
+    small = shrunk(replace(view, mask=mask), 2)
+    assert small.mask is not None
+    assert not small.mask[:, :7].any(), "one pixel of four"
+    assert small.mask[:, 9:].all()
+
+
 def test_views_keep_their_size_unless_it_is_asked_for_or_where_they_are_small():
     scene = small_scene()
     plain = GrowingViews(scene.train, small_schedule())
