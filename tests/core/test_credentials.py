@@ -101,4 +101,4 @@ def test_secrets_of_a_known_address_are_hidden_wherever_they_stand(monkeypatch):
     hide("ftp://me:run@host")  # short: a word of any text
     assert redact("rtgs run me:run@host") == "rtgs run ***@host"
     hide("http://host:5000")
-    assert len(credentials._addresses) == 2
+    assert len(credentials._addresses) == 3

@@ -13,7 +13,7 @@ from rtgs.scenes.settings import SceneSettings
 
 def test_hull_and_fused_depths_against_the_true_container(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(mesh, "HullSettings", partial(HullSettings, voxels=32, outvoted=0))
-    scene = load_scene(SceneSettings(name="ball_statue", path=str(embedded_capture("ball_statue")), long_side=64))
+    scene = load_scene(SceneSettings(name="ball_statue", path=str(embedded_capture("ball_statue")), long_side=96))
     hull, fused = ([cell.strip() for cell in row.split("|")[1:-1]] for row in mesh.measure("ball_statue", scene))
     assert len(hull) == len(fused) == mesh.HEADER.count("|") - 1
     assert (hull[:2], fused[:2]) == (["ball_statue", "hull, k = 0"], ["ball_statue", "TSDF of the true depth"])
@@ -23,5 +23,5 @@ def test_hull_and_fused_depths_against_the_true_container(monkeypatch: pytest.Mo
         assert min(iou, plain, front, back) > 0.95
         assert distance < 0.01
     degrees = [float(row[8].split(" / ")[0]) for row in (hull, fused)]
-    assert degrees[0] < 2.5
-    assert degrees[1] < 1.7, "2.2 without the mean over the neighbourhood"
+    assert degrees[0] < 3.2
+    assert degrees[1] < 1.2
