@@ -61,9 +61,7 @@ def test_training_parts_of_a_glass_scene_holds_mesh_and_third_stage(run) -> None
 def test_transmittance_step(run) -> None:
     words = ("--steps", "20", "--settle", "2", "--rounds", "2", "--set", *GLASS)
     figures = run(transmittance_step, "--scene", "ball_statue", *words)
-    assert figures["mask_share"] == pytest.approx(0.194, abs=0.005), (
-        "0.25, and less in one view of four, of a wide lens"
-    )
+    assert figures["mask_share"] == pytest.approx(0.194, abs=0.005), "0.25, and less in every fourth, wide view"
     assert figures["ratio"] == pytest.approx(figures["third_stage_ms"] / figures["second_stage_ms"], abs=2e-2)
     assert {"transmittance", "interface"} <= set(figures["surfels"])
     assert figures["machine"]["isa"]
