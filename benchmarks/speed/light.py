@@ -1,10 +1,11 @@
-"""Cubemaps: lookups and prefilter, forward and backward, native beside the plain-torch twins in float32, one thread.
+"""Far light, native beside its plain-torch twins in float32, forward and backward, one thread.
 
 ``python -m benchmarks.speed.light``: CPU milliseconds of the calling thread, the fastest of many calls, for 256 x 192
 pixels and the pyramid 64/32/16/16 of the short presets. Twins of the prefilter multiply dense matrices of the same
-weights. The last line is a JSON object: ``{part}_ms``, ``{part}_torch_ms``, ``{part}_ratio`` (torch / native) and the
-instruction set; ``step`` is the sum of a step with a prefilter (lookup with mips, prefilter, irradiance with its
-lookup), ``made_seconds`` what making the weights takes, once per process.
+weights. ``features`` is the light of Ref-GS: a map of 64 rows with a network of 32. The last line is a JSON object:
+``{part}_ms``, ``{part}_torch_ms``, ``{part}_ratio`` (torch / native) and the instruction set; ``step`` is the sum of a
+step with a prefilter (lookup with mips, prefilter, irradiance with its lookup), ``made_seconds`` what making the
+weights takes, once per process.
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ import torch
 from torch import Tensor
 
 from rtgs.light.faces import texel_areas, texel_directions
+from rtgs.light.feature_map import box_pyramid
+from rtgs.light.feature_network import DIRECTION, SURFACE, first_weights, mirrored_light, mirrored_light_twin
 from rtgs.light.lookup import cube_lookup, cube_lookup_twin, texel_count
 from rtgs.light.prefilter import filter_of, filtered, level_roughness, lobe, shrunk
 from rtgs.native import core
@@ -29,6 +32,7 @@ SIDES = (64, 32, 16, 16)
 DIFFUSE = 16
 ONE_LEVEL = 128  # 3DGS-DR
 NATIVE_CALLS, TORCH_CALLS = 40, 5
+FEATURES, WIDTH = 64, 32  # rows of the map of Ref-GS, width of its network
 STEP = ("lookup", "prefilter", "diffuse_lookup", "diffuse_prefilter")
 
 
@@ -79,7 +83,21 @@ def parts(size: tuple[int, int], sides: tuple[int, ...], one_level: int) -> dict
 
         return Part((texels,), lambda: torch.cat([filtered(small(side), side, rough) for side, rough in levels]), twin)
 
+    def features() -> Part:
+        texels = torch.randn(FEATURES, 2 * FEATURES, DIRECTION, generator=generator).requires_grad_()
+        roughness = torch.rand(len(directions), generator=generator).requires_grad_()
+        surface = torch.randn(len(directions), SURFACE, generator=generator).requires_grad_()
+        weights = {name: each.requires_grad_() for name, each in first_weights(WIDTH, generator).items()}
+        rest = (FEATURES, directions, roughness, surface)
+        levels = (FEATURES, directions, (FEATURES.bit_length() - 1) * roughness, surface)
+        return Part(
+            (texels, directions, roughness, surface, *weights.values()),
+            lambda: mirrored_light(weights, box_pyramid(texels), *rest),
+            lambda: mirrored_light_twin(weights, box_pyramid(texels), *levels),
+        )
+
     return {
+        "features": features(),
         "lookup": lookup(drawn(texel_count(sides)), sides, level),
         "prefilter": prefilter(list(zip(sides, level_roughness(len(sides))))),
         "diffuse_lookup": lookup(drawn(texel_count((DIFFUSE,))), (DIFFUSE,), None),
@@ -120,7 +138,7 @@ def main() -> None:
     argparse.ArgumentParser(description=__doc__).parse_args()
     torch.set_num_threads(1)
     found = figures()
-    for name in (*STEP, "step", f"lookup_{ONE_LEVEL}"):
+    for name in (*STEP, "step", f"lookup_{ONE_LEVEL}", "features"):
         ours, theirs = found[f"{name}_ms"], found[f"{name}_torch_ms"]
         print(f"{name:20s} native {ours:8.2f} ms   torch {theirs:8.2f} ms   {theirs / ours:6.1f}x")
     print(json.dumps({"isa": core.isa()} | {key: round(value, 3) for key, value in found.items()}))

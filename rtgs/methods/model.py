@@ -216,8 +216,11 @@ class Model:
         return tuple(self._between(step + 1))
 
     def _between(self, following: int) -> Iterator[StepEvent]:
+        def look(view: View, options: RenderOptions) -> RenderedView:
+            return self.render(view.camera, following, Mode.EVALUATE, options, view.mask)
+
         for part in self.parts.values():
-            yield from part.judge(following)
+            yield from part.judge(following, look)
         for part in self.parts.values():
             yield from part.control(following)
 

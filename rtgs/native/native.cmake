@@ -10,6 +10,7 @@ set(RTGS_KERNELS
   image/srgb.cpp
   light/lookup.cpp
   light/filter.cpp
+  light/features.cpp
   raster/surfel_project.cpp
   raster/surfel_project_backward.cpp
   raster/surfel_wide_scales.cpp
@@ -37,6 +38,7 @@ set(RTGS_BINDINGS
   bind/srgb.cpp
   light/border.cpp
   bind/light.cpp
+  bind/features.cpp
   bind/raster.cpp
   bind/ellipsoids.cpp
   trace/bvh_tree.cpp

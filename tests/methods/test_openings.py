@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,10 +21,15 @@ from rtgs.mesh.container import ObjectGuide, ObjectMesh
 from rtgs.mesh.lathe import Axis, lathe
 from rtgs.mesh.panels import parts_between_creases
 from rtgs.methods import Mode, RenderOptions
+from rtgs.methods.model import Model
 from rtgs.methods.parts import wall_light
+from rtgs.methods.parts.exposure import Exposure
 from rtgs.methods.parts.glass import Glass
 from rtgs.methods.parts.openings import Openings, judged_openings, upward_parts
+from rtgs.methods.parts.part import Look
+from rtgs.methods.photo_settings import AppearanceSettings
 from rtgs.scenes.scene import View
+from rtgs.train.method import RenderedView
 from rtgs.train.trainer import Trainer
 
 VOXEL = 0.02
@@ -206,13 +212,22 @@ def test_before_it_is_judged_a_part_is_open_by_turns_in_training_alone(standing:
     assert known == [False, True, False, False]
 
 
+def looked(method: Model, step: int) -> Look:
+    """As the model looks at its training views between steps."""
+
+    def look(view: View, options: RenderOptions) -> RenderedView:
+        return method.render(view.camera, step, Mode.EVALUATE, options, view.mask)
+
+    return look
+
+
 def test_a_run_judges_once_and_goes_on_bit_for_bit(standing: GlassScene):
     made = standing
     method = begun(fresnel(openings=0.2), made)
     glass = method.parts["glass"]
     assert isinstance(glass, Glass)
     assert glass.plan.start < glass.plan.judged < 60
-    said = [event for step in range(glass.plan.start + 1, 60) for event in glass.judge(step)]
+    said = [event for step in range(glass.plan.start + 1, 60) for event in glass.judge(step, looked(method, step))]
     assert len(said) == 1
     assert said[0].detail.startswith("openings of the object: ")
     state = {name: value.clone() for name, value in method.state().items()}
@@ -226,7 +241,37 @@ def test_a_run_judges_once_and_goes_on_bit_for_bit(standing: GlassScene):
         images = [each.render(view.camera, STEP, Mode.EVALUATE, mask=view.mask).image for each in (method, other)]
     assert torch.equal(*images)
     never = begun(fresnel(), made)
-    assert [event for step in range(60) for event in never.parts["glass"].judge(step)] == []
+    none = [event for step in range(60) for event in never.parts["glass"].judge(step, looked(never, step))]
+    assert none == []
+
+
+def test_photos_are_judged_as_they_were_exposed(standing: GlassScene, monkeypatch: pytest.MonkeyPatch):
+    """A photo that is a stop brighter than the others says nothing about openings."""
+    views = [replace(each, camera=replace(each.camera, name=each.name)) for each in standing.scene.train]
+    made = replace(standing, scene=replace(standing.scene, train=tuple(views)))
+    method = begun(replace(fresnel(openings=0.2), appearance=AppearanceSettings(enabled=True)), made)
+    glass, exposure = method.parts["glass"], method.parts["exposure"]
+    assert isinstance(glass, Glass)
+    assert isinstance(exposure, Exposure)
+    view = made.scene.train[0]
+    with torch.no_grad():
+        exposure.group["stops"][exposure.rows[view.name]] = 1.0
+    seen: list[Tensor] = []
+
+    def judged(look: Callable[[View], Tensor]) -> str:
+        seen.append(look(view))
+        return "none"
+
+    monkeypatch.setattr(glass.wall, "judge", judged)
+    following = glass.plan.judged
+    with torch.no_grad():
+        events = list(method._between(following))
+        shown = method.render(view.camera, following, Mode.EVALUATE, RenderOptions(masks="given"), view.mask)
+        exposure.group["stops"].zero_()
+        plain = method.render(view.camera, following, Mode.EVALUATE, RenderOptions(masks="given"), view.mask)
+    assert any("openings of the object: none" in event.detail for event in events)
+    torch.testing.assert_close(seen[0], 2 * plain.image)
+    torch.testing.assert_close(seen[0], shown.image)
 
 
 @pytest.mark.parametrize("killed", [-1, 0, 1])

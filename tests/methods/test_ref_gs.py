@@ -19,6 +19,7 @@ from rtgs.config import compose
 from rtgs.core.errors import RtgsError
 from rtgs.gaussians.ply import read_gaussians, write_ply
 from rtgs.light.feature_map import box_pyramid, map_lookup
+from rtgs.light.feature_network import INPUTS, first_weights, light_of, mirrored_light
 from rtgs.light.pictures import save_environment
 from rtgs.light.settings import EnvironmentSettings
 from rtgs.methods import Mode, RenderOptions, create_method, find_method
@@ -29,7 +30,6 @@ from rtgs.methods.parts.feature_mirror import ALBEDO, FEATURE, OUTSIDE, ROUGHNES
 from rtgs.methods.photo_settings import AppearanceSettings
 from rtgs.methods.ref_gs import FeatureSettings
 from rtgs.methods.settings import MethodSettings
-from rtgs.methods.shading.feature_light import INPUTS, first_weights, light_of, mirrored_light
 from rtgs.optics.light import encoded, encoded_twin
 from rtgs.runs.views import view_maps
 from rtgs.train.coverage_losses import opacity_entropy

@@ -24,6 +24,8 @@ TESTS = (
     "tests/methods/test_mirror_native.py",
     "tests/methods/test_thread_bits.py",
     "tests/optics/test_light.py",
+    "tests/light/test_cube_lookup.py",
+    "tests/light/test_feature_network.py",
 )
 # A read past the end of an array, which the sanitizer must report: else it is not at work.
 _CANARY = f"""

@@ -85,6 +85,13 @@ def _padded(padded: np.ndarray) -> None:
     core.cube_pad(np.zeros(5, np.int32), _CORNERS, _floats(3, 3) / 3, padded)
 
 
+def _features(color: np.ndarray) -> None:
+    network = [(16, 80), (16, 16), (8, 16), (80, 16), (16, 16), (16, 16), (16,), (16,), (16,)]
+    given = (np.array([4, 2], np.int32), tuple(_floats(*shape) for shape in network), _floats(_PIXELS, 3))
+    more = (_floats(_PIXELS), _floats(_PIXELS, 4), _floats(core.feature_scratch(16)))
+    core.feature_light(_floats(40, 16), *given, *more, _floats(_PIXELS, 16), _floats(_PIXELS, 2), color, 1)
+
+
 # The call, and the shape of the array that it fills.
 OUTPUTS: dict[str, tuple[Callable[[np.ndarray], None], tuple[int, ...]]] = {
     "raster": (_rasterise, (3, 16, 16)),
@@ -99,6 +106,7 @@ OUTPUTS: dict[str, tuple[Callable[[np.ndarray], None], tuple[int, ...]]] = {
     "decode": (lambda out: core.srgb_decode(_floats(4), out, 1), (4,)),
     "cube lookup": (_light, (_PIXELS, 3)),
     "cube pad": (_padded, (5, 4)),
+    "feature light": (_features, (_PIXELS, 3)),
 }  # fmt: skip
 
 

@@ -61,6 +61,15 @@ def _filter(threads: int) -> None:
     core.cube_filter(rows, np.array([0, 1], np.int64), rows, *numbers, *maps, threads)
 
 
+def _features(threads: int) -> None:
+    network = [(16, 80), (16, 16), (8, 16), (80, 16), (16, 16), (16, 16), (16,), (16,), (16,)]
+    sides, arrays = np.array([4, 2], np.int32), tuple(_floats(*shape) for shape in network)
+    rays, work = (_floats(4, 3), _floats(4), _floats(4, 4)), _floats(core.feature_scratch(16))
+    core.feature_light(
+        _floats(40, 16), sides, arrays, *rays, work, _floats(4, 16), _floats(4, 2), _floats(4, 3), threads
+    )
+
+
 CALLS = {
     "rasterise surfels": _raster,
     "rasterise ellipsoids": _ellipsoids,
@@ -89,6 +98,7 @@ CALLS = {
         _floats(6 * 16, 4), np.array([2], np.int32), _floats(4, 3), _floats(0), _floats(4, 3), threads
     ),
     "cube filter": _filter,
+    "feature light": _features,
 }
 
 

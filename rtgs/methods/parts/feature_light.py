@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from rtgs.light.feature_map import box_pyramid
+from rtgs.light.feature_network import DIRECTION, LAYERS, first_weights, mirrored_light
 from rtgs.light.pictures import mean_frame
 from rtgs.methods.parts.environment import NAME
-from rtgs.methods.shading.feature_light import DIRECTION, LAYERS, first_weights, mirrored_light
 from rtgs.optics.light import encoded
 from rtgs.train.parameters import ParameterGroup, Rate
 

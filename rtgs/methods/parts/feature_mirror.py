@@ -15,12 +15,12 @@ from torch import Tensor
 
 from rtgs.gaussians.channels import Channel
 from rtgs.gaussians.surfels import ActivatedGaussians
+from rtgs.light.feature_network import SURFACE
 from rtgs.methods.parts.base import BaseSet, composited
 from rtgs.methods.parts.feature_light import FeatureLight, LearnedLight
 from rtgs.methods.parts.part import Frame, Part, Raster
 from rtgs.methods.plans import reflection_plan
 from rtgs.methods.shading.deferred import mirror_directions
-from rtgs.methods.shading.feature_light import SURFACE
 from rtgs.optics.light import encoded
 from rtgs.train.method import RenderedView, RenderOptions, Stage, StepEvent
 from rtgs.train.parameters import ParameterGroup

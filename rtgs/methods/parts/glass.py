@@ -24,7 +24,7 @@ from rtgs.methods.parts.glass_pixels import object_pixels
 from rtgs.methods.parts.glass_sets import drawn_in_box, interface_set, taken_from_base, transmittance_set
 from rtgs.methods.parts.interface_set import InterfaceSet, interface_surfels
 from rtgs.methods.parts.mirror import Mirror, Reflected, stored_surfels
-from rtgs.methods.parts.part import Frame, Part, Raster, Rows
+from rtgs.methods.parts.part import Frame, Look, Part, Raster, Rows
 from rtgs.methods.parts.rough_walls import GlassView, Scatter, bent_rays
 from rtgs.methods.parts.straight_rays import FarWall, StraightRays
 from rtgs.methods.parts.traced_set import FollowingTree, TracedSet
@@ -36,7 +36,7 @@ from rtgs.methods.shading.lights import Light, Traced, lit_view, mean_of_lights
 from rtgs.methods.shading.mirror import SurfacePixels, reflected_weight
 from rtgs.methods.shading.outline import Outline, with_beside
 from rtgs.methods.shading.straight import GlassPixels, Transmission, glass_rays, glass_weights
-from rtgs.train.method import Mode, Observation, RenderedView, RenderOptions, Stage, StepEvent
+from rtgs.train.method import Observation, RenderedView, RenderOptions, Stage, StepEvent
 from rtgs.train.parameters import ParameterGroup
 from rtgs.train.schedule import (
     densify_ahead,
@@ -333,19 +333,12 @@ class Glass(Part):
             clock = self.plan.clock(step)
             self.transmittance.step(clock, self._own_degree(step), observations.get(self.transmittance.name))
 
-    def judge(self, following: int) -> Iterator[StepEvent]:
+    def judge(self, following: int, look: Look) -> Iterator[StepEvent]:
         """Look at some training views: where is the object open?"""
         if self.wall is None or not self.plan.start < following == self.plan.judged < self.schedule.total:
             return
-        if found := self.wall.judge(lambda view: self._look(view, following).image):
+        if found := self.wall.judge(lambda view: look(view, RenderOptions(masks="given")).image):
             yield StepEvent("decision", "transmittance", f"openings of the object: {found}")
-
-    def _look(self, view: View, step: int) -> RenderedView:
-        frame = Frame(view.camera, step, Mode.EVALUATE, RenderOptions(masks="given"), view.mask)
-        more = () if (rows := self.appended(frame)) is None else (rows,)
-        shaded = self.shade(frame, self.base.rasterize(frame, frame.options.plus(self.mirror.needs(frame)), more))
-        assert shaded is not None
-        return shaded
 
     def control(self, following: int) -> Iterator[StepEvent]:
         """Density control of the transmittance set on its own clock; the mesh of the vertices that were learned."""

@@ -23,7 +23,7 @@ from rtgs.methods.parts.base import BaseSet
 from rtgs.methods.parts.environment import Environment
 from rtgs.methods.parts.gaussian_set import GaussianSet, densified, opacity_reset
 from rtgs.methods.parts.matte import MatteEvidence, gather_evidence
-from rtgs.methods.parts.part import Frame, Part, Raster
+from rtgs.methods.parts.part import Frame, Look, Part, Raster
 from rtgs.methods.parts.propagation import propagate_normals, reset_specular
 from rtgs.methods.parts.reflection_init import copied_surfels, reflection_surfels, scene_color
 from rtgs.methods.parts.traced_set import TracedSet
@@ -309,7 +309,7 @@ class Mirror(Part):
             self.set.step(step, self._degree(step), observations.get(self.set.name))
             self.set.perturb(step, self.generator)
 
-    def judge(self, following: int) -> Iterator[StepEvent]:
+    def judge(self, following: int, look: Look) -> Iterator[StepEvent]:
         """Look at some training views; a scene with nothing specular goes on without this part."""
         if self.set is None or not self.plan.start < following == self.plan.judged < self.schedule.total:
             return

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -20,6 +20,7 @@ from rtgs.train.method import Mode, Observation, RenderedView, RenderOptions, St
 if TYPE_CHECKING:
     from rtgs.light.cubemap import DirectionalLight
     from rtgs.methods.parts.gaussian_set import GaussianSet
+    from rtgs.scenes.scene import View
     from rtgs.train.parameters import ParameterGroup
 
 
@@ -79,6 +80,9 @@ class Raster:
     observations: tuple[Observation, ...] = ()
 
 
+Look = Callable[["View", RenderOptions], RenderedView]
+
+
 class Part:
     """A part of a model: its hooks, with nothing in them. A part overrides those in which it has something to do."""
 
@@ -132,8 +136,9 @@ class Part:
         """Adam on the sets after the backward pass; ``observations`` of the view by the name of the set. The model
         steps the groups."""
 
-    def judge(self, following: int) -> Iterable[StepEvent]:
-        """Whether the part goes on, before anything changes ahead of step ``following``."""
+    def judge(self, following: int, look: Look) -> Iterable[StepEvent]:
+        """Whether the part goes on, before anything changes ahead of step ``following``; ``look`` renders a training
+        view as the whole model shows it now."""
         return ()
 
     def control(self, following: int) -> Iterable[StepEvent]:

@@ -1,6 +1,6 @@
 """Trainings end with the bits they ended with when methods were classes: digests recorded by the code of that time.
 
-Compared are the first and second stages of the four methods on ball_statue and toycar, preset ``smoke`` and 300 steps
+Compared are all stages of the four methods on ball_statue and toycar, preset ``smoke`` and 300 steps
 of ``quick``. ``golden_checkpoints.json`` holds their digests by step and key. One instruction set, one PyTorch and
 processors of one maker made them; on others, bits differ, and the test is skipped. A stage that gets a new version gets
 new keys, and keeps its digests here where its bits are the old ones. When a recipe or a result is meant to change, its
@@ -69,7 +69,7 @@ def test_checkpoints_have_the_recorded_bits(scene: str, method: str, tmp_path: P
     monkeypatch.setenv("RTGS_ROOT", str(tmp_path))
     found = digests(scene, method, tmp_path)
     known = {key: GOLDEN["checkpoints"][key] for key in found if key in GOLDEN["checkpoints"]}
-    stages = {"2dgs": 1, "3dgs": 1, "envgs": 2, "rtgs": 2}[method]  # rtgs's third is another since
+    stages = {"2dgs": 1, "3dgs": 1, "envgs": 2, "rtgs": 3}[method]
     assert len(known) == 2 * stages, "of both presets"
     assert {key: found[key] for key in known} == known
 
