@@ -12,14 +12,14 @@ from rtgs.config import RunConfig, compose
 from rtgs.config.explain import close_keys
 from rtgs.config.keys import Key, config_keys, own_keys, sentence_of, words_of_value
 from rtgs.config.locate import project_root
+from rtgs.config.opened import OPTIONS, friendly_words, split_config_dir, with_configs
 from rtgs.config.provenance import Setting, settings_of
-from rtgs.config.words import friendly_overrides
 from rtgs.core.credentials import redact
 from rtgs.core.errors import RtgsError
 from rtgs.core.listing import columns
 from rtgs.methods import find_method
 
-HELP = """rtgs explain [KEY ...] [words of a run]
+HELP = """rtgs explain [KEY ...] [--config-dir FOLDER] [words of a run]
 
   rtgs explain schedule.total                 what it means, its value and default, where it is set
   rtgs explain schedule.total preset=paper    the same in the run of these words
@@ -38,14 +38,15 @@ def explain(words: Sequence[str]) -> int:
     if words[:1] in (["-h"], ["--help"]):
         print(HELP)
         return 0
-    asked = [word for word in words if "=" not in word]
-    overrides = friendly_overrides([word for word in words if "=" in word])
-    config, _ = compose(overrides)
-    names = asked or [""]
-    texts, keys = [], keys_of(config)
-    for name in names:
-        key = keys.get(name)
-        texts.append(_listed(name, config) if key is None else one_key(key, config, overrides))
+    rest, more = split_config_dir(words)
+    asked = [word for word in rest if "=" not in word]
+    overrides, _ = friendly_words([*([] if more is None else [OPTIONS[0], str(more)]), *(w for w in rest if "=" in w)])
+    with with_configs(more):
+        config, _ = compose(overrides)
+        texts, keys = [], keys_of(config)
+        for name in asked or [""]:
+            key = keys.get(name)
+            texts.append(_listed(name, config) if key is None else one_key(key, config, overrides))
     print("\n\n".join(texts))
     return 0
 

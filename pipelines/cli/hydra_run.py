@@ -9,18 +9,18 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import io
 import logging
 import re
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from typing import Any
 
 from hydra import version
 from hydra._internal.callbacks import Callbacks
 from hydra._internal.hydra import Hydra
-from hydra._internal.utils import create_config_search_path, get_args_parser
-from hydra.core.config_search_path import SearchPathQuery
+from hydra._internal.utils import get_args_parser
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.plugins import Plugins
@@ -30,9 +30,10 @@ from omegaconf import DictConfig, OmegaConf
 from pipelines.cli.app import NO_SWEEP, Membership, RunOutcome, execute, short
 from pipelines.cli.sweep_summary import finished_elsewhere, same_folders, side_by_side, write_tables
 from pipelines.planning.sweep import Sweep
-from rtgs.config.compose import VERSION_BASE, choices_from
+from rtgs.config.compose import choices_from
 from rtgs.config.convert import hide_credentials, to_run_config
 from rtgs.config.locate import conf_dir
+from rtgs.config.opened import VERSION_BASE, more_folder, search_path
 from rtgs.config.schema import register_schema
 from rtgs.config.words import friendly_overrides
 from rtgs.core.credentials import redact
@@ -42,6 +43,7 @@ from rtgs.workflow import SweepOutcomes
 log = logging.getLogger("rtgs")
 TOPLEVEL_PLUGINS = "hydra_plugins"  # where Hydra wants them
 _JOB_NAME = "app"  # of the log file in a run's output folder
+_NOT_CHOSEN = ("after_preset: ", "figure: ")  # folders of conf/ that are no groups of a run
 
 
 class HydraApp:
@@ -158,12 +160,8 @@ def _check(options: argparse.Namespace) -> None:
 def _hydra(options: argparse.Namespace) -> Iterator[Hydra]:
     """Hydra over the folder of configs and ``--config-dir``, gone when the run is."""
     folder = conf_dir() if options.config_path is None else Path(options.config_path).absolute()
-    search = create_config_search_path(str(folder))
-    if options.config_dir is not None:
-        more = Path(options.config_dir).absolute()
-        if not more.is_dir():
-            raise RtgsError(f"--config-dir {more} is no folder")
-        search.prepend("command-line", f"file://{more}", SearchPathQuery(provider="schema", path=None))
+    more = None if options.config_dir is None else more_folder(options.config_dir)
+    search = search_path(folder, more)
     version.setbase(VERSION_BASE)
     hydra = Hydra.create_main_hydra2(task_name=_JOB_NAME, config_search_path=search)
     try:
@@ -181,7 +179,10 @@ def _answer(hydra: Hydra, name: str, options: argparse.Namespace, parser: argpar
     """Print what was asked for instead of a run."""
     overrides = options.overrides
     if options.help:
-        hydra.app_help(config_name=name, args_parser=parser, args=options)
+        text = io.StringIO()
+        with redirect_stdout(text):
+            hydra.app_help(config_name=name, args_parser=parser, args=options)
+        print("\n".join(line for line in text.getvalue().splitlines() if not line.startswith(_NOT_CHOSEN)))
     elif options.hydra_help:
         hydra.hydra_help(config_name=name, args_parser=parser, args=options)
     elif options.cfg:

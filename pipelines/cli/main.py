@@ -233,8 +233,9 @@ def weights(words: list[str]) -> int:
     parser = argparse.ArgumentParser("rtgs weights", description="Pretrained files; nothing is downloaded.")
     parser.add_argument("action", nargs="?", choices=("status",), default="status", help="what is known, what is there")
     parser.parse_args(words)
+    from rtgs.core.files import sha256_of
     from rtgs.prepare.pretrained import REGISTRY
-    from rtgs.pretrained.weights import sha256_of, weight_folders, weights_report
+    from rtgs.pretrained.weights import weight_folders, weights_report
 
     for status in weights_report(files=REGISTRY.values()):
         file = status.file

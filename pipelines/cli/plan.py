@@ -10,7 +10,7 @@ from pipelines.planning.rows import plan_rows
 from rtgs.core.listing import columns
 from rtgs.workflow import Plan, Store, make_plan
 
-HELP = """rtgs plan [--multirun] [group=choice] [key=value]
+HELP = """rtgs plan [--multirun] [--config-dir FOLDER] [group=choice] [key=value]
 
 The words of `rtgs run`; prints the plan and runs nothing. Of a sweep, the merged plan of all jobs: what they share is
 one line, with the number of jobs that need it. Exit code 1 when a job of it could not start."""

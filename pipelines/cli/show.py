@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipelines.cli.words import size
 from rtgs.core.documents import load_json
 from rtgs.core.errors import RtgsError
 from rtgs.core.names import unique_stems
@@ -119,10 +120,10 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _size(text: str) -> tuple[int, int]:
-    width, _, height = text.lower().partition("x")
-    if not (width.isdigit() and height.isdigit() and int(width) and int(height)):
-        raise argparse.ArgumentTypeError(f"{text!r} is no size such as 800x600")
-    return int(width), int(height)
+    try:
+        return size(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} {error}") from error
 
 
 def _vector(text: str) -> tuple[float, float, float]:

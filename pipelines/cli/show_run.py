@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipelines.cli.words import THREADS, Reader, place, read_words, some_of, whole
+from pipelines.cli.words import THREADS, Reader, place, read_words, size, some_of, whole
 from rtgs.core.errors import RtgsError
 
 if TYPE_CHECKING:
@@ -95,19 +95,12 @@ def parse_words(words: Sequence[str]) -> ShowWords:
     return ShowWords(**read_words("rtgs show", words, _READERS, options=options, help=HELP))
 
 
-def _size(value: str) -> tuple[int, int]:
-    width, _, height = value.lower().partition("x")
-    if not (width.isdecimal() and height.isdecimal() and 8 <= int(width[:6]) <= 8192 and 8 <= int(height[:6]) <= 8192):
-        raise ValueError("is no size such as 640x480 (8 to 8192 pixels)")
-    return int(width), int(height)
-
-
 _READERS: dict[str, Reader] = {
     "path": str,
     "layer": str,
     "frames": whole(1, MOST_FRAMES),
     "fps": whole(1, 240),
-    "size": _size,
+    "size": size,
     "format": some_of(FORMATS),
     "transform": place,
     "out": place,

@@ -80,6 +80,14 @@ def some_of(names: Sequence[str]) -> Reader:
     return read
 
 
+def size(value: str) -> tuple[int, int]:
+    """Width and height in pixels."""
+    width, _, height = value.lower().partition("x")
+    if not (width.isdecimal() and height.isdecimal() and 8 <= int(width[:6]) <= 8192 and 8 <= int(height[:6]) <= 8192):
+        raise ValueError("is no size such as 640x480 (8 to 8192 pixels)")
+    return int(width), int(height)
+
+
 def place(value: str) -> Path:
     """A file or a folder."""
     if not value:

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 from pipelines.planning.graph import build_graph
 from pipelines.planning.inspection import Inspections
+from rtgs.config.opened import friendly_words, with_configs
 from rtgs.config.schema import Choices, RunConfig
 from rtgs.config.sweep import ComposedJob, compose_jobs
-from rtgs.config.words import friendly_overrides
 from rtgs.core.decisions import Decision
 from rtgs.core.errors import RtgsError
 from rtgs.workflow import Plan, RemoteStore, Step, topological
@@ -84,13 +84,17 @@ def jobs_of_words(words: Sequence[str]) -> tuple[tuple[ComposedJob, ...], bool]:
     """The jobs that ``rtgs run <words>`` would start, and whether they are those of a sweep.
 
     Raises:
-        RtgsError: an option besides ``--multirun``.
+        RtgsError: an option besides ``--multirun`` and ``--config-dir``.
     """
-    friendly = friendly_overrides(words)
+    friendly, more = friendly_words(words)
     options = [word for word in friendly if word.startswith("-")]
     if unknown := [word for word in options if word not in ("-m", "--multirun")]:
-        raise RtgsError(f"unknown option {unknown[0]}: give --multirun, group=choice and key=value (rtgs plan --help)")
-    return compose_jobs([word for word in friendly if word not in options], bool(options))
+        raise RtgsError(
+            f"unknown option {unknown[0]}: give --multirun, --config-dir FOLDER, group=choice and key=value "
+            "(rtgs plan --help)"
+        )
+    with with_configs(more):
+        return compose_jobs([word for word in friendly if word not in options], bool(options))
 
 
 def steps_of_words(words: Sequence[str]) -> tuple[Step, ...]:

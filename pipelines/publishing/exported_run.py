@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rtgs.core.errors import RtgsError
+from rtgs.core.files import sha256_of
 from rtgs.core.records import read_record, write_json
 from rtgs.methods.spec import RASTERIZED
 from rtgs.runs.record import RunRecord
@@ -164,7 +165,6 @@ def export_run(run: ShownRun, settings: BakeSettings, out: Path, *, clear: bool 
     """
     from rtgs.export.bake import BAKE_VERSION, choose_cameras
     from rtgs.gaussians.ply import write_ply
-    from rtgs.pretrained.weights import sha256_of
 
     name = f"{run.folder.name}-clear" if clear else run.folder.name
     ply, json = out / f"{name}.ply", out / f"{name}.json"

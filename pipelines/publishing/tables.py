@@ -12,11 +12,11 @@ from pipelines.publishing.against_paper import ways_of
 from pipelines.publishing.results import evaluation_of, folders, was_trained
 from rtgs.config.schema import RunConfig
 from rtgs.core.documents import load_json
+from rtgs.core.files import sha256_of
 from rtgs.evaluate.publish import PAPER_DATA, Measured, TableSpec, build_table
 from rtgs.evaluate.table_formats import write_table
 from rtgs.track.protocol import Scalar
 from rtgs.workflow import StepResult
-from rtgs.workflow.fingerprint import file_digest
 
 _FIGURES = (("PSNR", "psnr"), ("SSIM", "ssim"), ("LPIPS", "lpips_01"), ("FLIP", "flip"))
 _TRACKED_FILE = ".tracked.json"  # beside a table: digests of its files by the tracker that has them
@@ -110,4 +110,4 @@ def _tracked_digests(paths: Sequence[Path]) -> dict[str, dict[str, str]]:
 
 
 def _digests(paths: Sequence[Path]) -> dict[str, str]:
-    return {path.name: file_digest(path) for path in paths}
+    return {path.name: sha256_of(path) for path in paths}

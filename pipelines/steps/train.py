@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING
 
 from pipelines.steps.extract_mesh import why_absent
 from pipelines.steps.training import train_stage
+from rtgs.core.files import sha256_of
 from rtgs.methods import MethodSpec, StageSpec, find_method, is_own, own_methods
 from rtgs.runs.training import StageParams, last_training, load_method
 from rtgs.train.networks import Named, check_networks, named_in_key
 from rtgs.workflow import Step, StepContext, StepKind
-from rtgs.workflow.fingerprint import file_digest, fingerprint
+from rtgs.workflow.fingerprint import fingerprint
 
 if TYPE_CHECKING:
     from rtgs.evaluate.boundary import BoundaryScores
@@ -102,7 +103,7 @@ def _source_digest(spec: MethodSpec) -> str:
     whole = (inspect.unwrap(getattr(each, "func", each)) for each in functions)
     outside = (each for each in whole if each.__module__.split(".")[0] != "rtgs")  # those of rtgs have versions
     files = sorted({file for each in outside if (file := inspect.getsourcefile(each)) is not None})
-    return fingerprint([file_digest(Path(file)) for file in files])
+    return fingerprint([sha256_of(Path(file)) for file in files])
 
 
 def training_kinds(specs: Iterable[MethodSpec] | None = None) -> tuple[StepKind, ...]:

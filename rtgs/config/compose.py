@@ -7,14 +7,12 @@ from collections.abc import Mapping, Sequence
 from omegaconf import DictConfig
 
 from rtgs.config.convert import to_run_config, with_own
-from rtgs.config.locate import conf_dir
+from rtgs.config.opened import opened_configs
 from rtgs.config.schema import Choices, RunConfig, register_schema
 from rtgs.core.build import build
 from rtgs.core.credentials import redact
 from rtgs.methods.settings import MethodSettings
 from rtgs.train.settings import ScheduleSettings
-
-VERSION_BASE = "1.3"
 
 
 def compose(overrides: Sequence[str]) -> tuple[RunConfig, Choices]:
@@ -25,10 +23,9 @@ def compose(overrides: Sequence[str]) -> tuple[RunConfig, Choices]:
         RtgsError: a value is missing.
     """
     from hydra import compose as hydra_compose
-    from hydra import initialize_config_dir
 
     register_schema()
-    with initialize_config_dir(str(conf_dir()), version_base=VERSION_BASE):
+    with opened_configs():
         composed = hydra_compose("config", overrides=list(overrides), return_hydra_config=True)
     hydra = composed.hydra
     choices = choices_from(hydra.runtime.choices, hydra.overrides.task)
@@ -43,7 +40,6 @@ def compose_plain(method: str, choices: Choices) -> tuple[MethodSettings, Schedu
         hydra.errors.HydraException: no such method or preset.
     """
     from hydra import compose as hydra_compose
-    from hydra import initialize_config_dir
     from hydra.core.global_hydra import GlobalHydra
     from omegaconf import OmegaConf
 
@@ -54,7 +50,7 @@ def compose_plain(method: str, choices: Choices) -> tuple[MethodSettings, Schedu
     if GlobalHydra.instance().is_initialized():  # in a job: it knows the folders that the command line adds
         composed = hydra_compose("config", overrides=words)
     else:
-        with initialize_config_dir(str(conf_dir()), version_base=VERSION_BASE):
+        with opened_configs():
             composed = hydra_compose("config", overrides=words)
     found, schedule = (OmegaConf.to_container(composed[group], resolve=True) for group in ("method", "schedule"))
     assert isinstance(found, dict)

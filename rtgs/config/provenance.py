@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-from rtgs.config.compose import VERSION_BASE
 from rtgs.config.locate import conf_dir
+from rtgs.config.opened import opened_configs
 from rtgs.config.schema import SCHEMA_NAME, register_schema
 
 _ABSENT = object()
@@ -27,7 +28,6 @@ def settings_of(key: str, words: Sequence[str]) -> list[Setting]:
     Raises:
         hydra.errors.HydraException: the words do not compose.
     """
-    from hydra import initialize_config_dir
     from hydra._internal.config_repository import CachingConfigRepository
     from hydra.core.global_hydra import GlobalHydra
     from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -36,7 +36,7 @@ def settings_of(key: str, words: Sequence[str]) -> list[Setting]:
 
     register_schema()
     found = []
-    with initialize_config_dir(str(conf_dir()), version_base=VERSION_BASE):
+    with opened_configs():
         loader: Any = GlobalHydra.instance().config_loader()
         overrides = OverridesParser.create(config_loader=loader).parse_overrides(list(words))
         repository = CachingConfigRepository(loader.repository)
@@ -47,11 +47,17 @@ def settings_of(key: str, words: Sequence[str]) -> list[Setting]:
             loaded = loader._load_single_config(default, repository)
             value = _at(OmegaConf.to_container(loaded.config, resolve=False), key)
             if value is not _ABSENT:
-                found.append(Setting(f"conf/{default.config_path}.yaml", str(value)))
+                found.append(Setting(f"{_folder(loaded.path)}/{default.config_path}.yaml", str(value)))
         for override in overrides:
             if override.key_or_group == key:
                 found.append(Setting("command line", str(override.value())))
     return found
+
+
+def _folder(searched: str) -> str:
+    """The folder of configs, as people name it; ``searched`` is Hydra's address of it."""
+    folder = searched.removeprefix("file://")
+    return "conf" if Path(folder) == conf_dir() else folder
 
 
 def _at(tree: Any, key: str) -> Any:

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from rtgs.config.compose import VERSION_BASE, choices_from, without_hydra
+from rtgs.config.compose import choices_from, without_hydra
 from rtgs.config.convert import to_run_config
-from rtgs.config.locate import conf_dir
+from rtgs.config.opened import opened_configs
 from rtgs.config.schema import Choices, RunConfig, register_schema
 from rtgs.core.errors import RtgsError
 
@@ -45,12 +45,11 @@ def compose_jobs(words: Sequence[str], multirun: bool) -> tuple[tuple[ComposedJo
         hydra.errors.HydraException: an override or a file does not fit the schema (its cause names the key).
         RtgsError: values are swept without ``--multirun``, or by another sweeper than Hydra's basic one.
     """
-    from hydra import initialize_config_dir
     from hydra.core.global_hydra import GlobalHydra
     from hydra.types import RunMode
 
     register_schema()
-    with initialize_config_dir(str(conf_dir()), version_base=VERSION_BASE):
+    with opened_configs():
         state = GlobalHydra.instance()
         assert state.hydra is not None
         words = [*words, "hydra.mode=MULTIRUN"] if multirun else list(words)

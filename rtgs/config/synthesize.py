@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 
-from rtgs.config.compose import VERSION_BASE, without_hydra
-from rtgs.config.locate import conf_dir
+from rtgs.config.compose import without_hydra
+from rtgs.config.opened import opened_configs
 from rtgs.config.schema import PathsConfig, open_schema
 from rtgs.core.build import build
 from rtgs.scenes.synthetic.settings import CaptureSettings
@@ -38,12 +38,12 @@ def compose_synthesize(overrides: Sequence[str]) -> SynthesizeConfig:
         hydra.errors.HydraException: an override does not fit the schema (its cause names the key).
         RtgsError: a value is out of range.
     """
-    from hydra import compose, initialize_config_dir
+    from hydra import compose
     from hydra.core.config_store import ConfigStore
     from omegaconf import OmegaConf
 
     ConfigStore.instance().store(name=SCHEMA_NAME, node=open_schema(SynthesizeConfig), provider="rtgs")
-    with initialize_config_dir(str(conf_dir()), version_base=VERSION_BASE):
+    with opened_configs():
         composed = compose("synthesize", overrides=list(overrides))
     values = OmegaConf.to_container(without_hydra(composed), resolve=True, throw_on_missing=True)
     assert isinstance(values, dict)

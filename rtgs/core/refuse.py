@@ -9,6 +9,7 @@ import difflib
 import math
 import types
 import typing
+from collections.abc import Sequence
 from dataclasses import fields
 from functools import cache
 from typing import Any
@@ -106,6 +107,15 @@ def refuse_below(key: str, value: float | None, least: float) -> None:
     """
     if value is not None:
         refuse_unless(math.isfinite(value) and value >= least, key, value, f"at least {least:g}")
+
+
+def refuse_bad_point(point: Sequence[float], key: str) -> None:
+    """Three finite numbers.
+
+    Raises:
+        RtgsError: names the key and the value.
+    """
+    refuse_unless(len(point) == 3 and all(map(math.isfinite, point)), key, list(point), "three numbers")
 
 
 def refuse_unknown_words(settings: object, where: str) -> None:

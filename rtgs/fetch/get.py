@@ -10,9 +10,10 @@ from pathlib import Path
 from filelock import FileLock
 
 from rtgs.core.errors import RtgsError
+from rtgs.core.files import sha256_of
 from rtgs.core.records import read_record, write_json
 from rtgs.fetch.catalogue import Capture, RemoteFile
-from rtgs.fetch.http import NotReached, download, parts_of, sha256_of
+from rtgs.fetch.http import NotReached, download, parts_of
 from rtgs.fetch.unpack import Limits, unpack
 
 SOURCE = "SOURCE.json"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import hashlib
 import http.client
 import os
 import re
@@ -15,6 +14,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from rtgs.core.errors import RtgsError
+from rtgs.core.files import sha256_of
 from rtgs.core.version import VERSION
 from rtgs.fetch.catalogue import RemoteFile
 
@@ -109,12 +109,6 @@ def parts_of(path: Path) -> tuple[Path, Path]:
     """What a :func:`download` to ``path`` that stopped leaves beside it."""
     part = _part_of(path)
     return part, _validator_file(part)
-
-
-def sha256_of(path: Path) -> str:
-    """The digest of a file, as hexadecimal digits."""
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def _of_this_machine(error: Exception) -> bool:

@@ -6,7 +6,7 @@ any kind may hold channels besides (``rtgs.gaussians.channels``).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar, Self
 
@@ -188,3 +188,8 @@ def tangents(quaternions: Tensor) -> tuple[Tensor, Tensor]:
     tangent_u = torch.stack((1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)), -1)
     tangent_v = torch.stack((2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)), -1)
     return tangent_u, tangent_v
+
+
+def in_sphere(points: Tensor, center: Sequence[float], radius: float) -> Tensor:
+    """(N,) bool: points (N, 3) in or on a sphere, world."""
+    return (points - torch.tensor(center, dtype=points.dtype)).square().sum(1) <= radius**2

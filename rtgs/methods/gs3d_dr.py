@@ -5,12 +5,11 @@ Its numbers are in conf/method/3dgs_dr.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
-from rtgs.core.refuse import refuse_bad_numbers, refuse_outside, refuse_unknown_words, refuse_unless
+from rtgs.core.refuse import refuse_bad_numbers, refuse_bad_point, refuse_outside, refuse_unknown_words, refuse_unless
 from rtgs.methods.family import cubemap_stages, guided
 from rtgs.methods.spec import HARMONICS, MethodSpec
 
@@ -39,8 +38,7 @@ class DeferredSettings:
         refuse_bad_numbers(self, "method.own")
         refuse_outside(self, "method.own", 0, 1, "weight_floor", open_low=True)
         refuse_unless(self.weight_floor < 1, "method.own.weight_floor", self.weight_floor, "below 1")
-        legal = len(self.scope_center) == 3 and all(math.isfinite(value) for value in self.scope_center)
-        refuse_unless(legal, "method.own.scope_center", list(self.scope_center), "three numbers")
+        refuse_bad_point(self.scope_center, "method.own.scope_center")
 
 
 def build(setup: Setup) -> Model:
@@ -68,20 +66,18 @@ def build(setup: Setup) -> Model:
 
 def scope_terms(base: BaseSet, own: DeferredSettings) -> Sequence[LossTerm]:
     """The mean m of the Gaussians whose centres are outside the scope, where there is one."""
-    import torch
-
+    from rtgs.gaussians.primitives import in_sphere
     from rtgs.methods.parts.cubemap_mirror import WEIGHT
     from rtgs.train.terms import LossTerm
 
     if own.scope_radius == 0 or own.outside == 0:
         return ()
-    center = torch.tensor(own.scope_center)
 
     def outside(rendered: object, view: object) -> Tensor | None:
         gaussians = base.set.gaussians
         if WEIGHT not in gaussians:
             return None
-        far = (gaussians.means.detach() - center).square().sum(1) > own.scope_radius**2
+        far = ~in_sphere(gaussians.means.detach(), own.scope_center, own.scope_radius)
         return gaussians.activated(WEIGHT)[far].mean() if bool(far.any()) else None
 
     return (LossTerm("outside", own.outside, outside),)

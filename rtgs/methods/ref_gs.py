@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from rtgs.core.refuse import refuse_bad_counts, refuse_outside, refuse_unless
+from rtgs.core.refuse import refuse_bad_counts, refuse_bad_point, refuse_outside, refuse_unless
 from rtgs.methods.family import cubemap_stages, guided
 from rtgs.methods.spec import HARMONICS, SURFACE, MethodSpec
 
@@ -47,8 +47,7 @@ class FeatureSettings:
         refuse_outside(self, "method.own", 0, math.inf, "network_rate", "albedo_gain", open_low=True)
         refuse_outside(self, "method.own", 0, math.inf, "feature_noise", "opacity_entropy", "scope_radius")
         refuse_unless(-12 < self.albedo < 5, "method.own.albedo", self.albedo, "between -12 and 5")
-        legal = len(self.scope_center) == 3 and all(math.isfinite(value) for value in self.scope_center)
-        refuse_unless(legal, "method.own.scope_center", list(self.scope_center), "three numbers")
+        refuse_bad_point(self.scope_center, "method.own.scope_center")
 
 
 def build(setup: Setup) -> Model:

@@ -6,7 +6,6 @@ whole registry, which ``rtgs weights status`` prints.
 
 from __future__ import annotations
 
-import hashlib
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rtgs.core.errors import RtgsError
+from rtgs.core.files import sha256_of
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -179,12 +179,6 @@ def check_noted_digest(path: Path, digest: str) -> None:
             f"{path} has SHA-256 {digest[:16]}..., {SUMS_FILE} beside it says {noted[:16]}...: it is another file, or "
             f"a copy cut short; copy it again, or correct {SUMS_FILE}"
         )
-
-
-def sha256_of(path: Path) -> str:
-    """Hexadecimal SHA-256 of a file."""
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def weights_report(

@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from functools import lru_cache
 from pathlib import Path
 
+from rtgs.core.files import sha256_of
 from rtgs.scenes.capture import Capture, raise_errors
 from rtgs.scenes.findings import missing_files
 from rtgs.scenes.importers.registry import read_capture
@@ -58,5 +59,4 @@ def files_digest(title: str, root: Path, files: Iterable[Path]) -> str:
 @lru_cache(maxsize=65536)
 def content_hash(path: str, size: int, mtime_ns: int) -> str:
     """SHA-256 of a file's content; size and time of change are the key under which this process remembers it."""
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    return sha256_of(Path(path))

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from rtgs.core.documents import load_json, parse_json
 from rtgs.core.errors import RtgsError
+from rtgs.core.files import sha256_of
 from rtgs.core.recipe import left_out_at
 from rtgs.core.records import record_of
 from rtgs.core.refuse import cut
@@ -95,7 +96,7 @@ def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> Path:
     tensors_path = temporary / TENSORS_FILE
     save_file({name: tensor.detach().contiguous() for name, tensor in checkpoint.tensors.items()}, tensors_path)
     _flush(tensors_path)
-    body = {"format": FORMAT, "tensors_sha256": _file_digest(tensors_path), "record": asdict(checkpoint.record)}
+    body = {"format": FORMAT, "tensors_sha256": sha256_of(tensors_path), "record": asdict(checkpoint.record)}
     record_path = temporary / RECORD_FILE
     record_path.write_text(json.dumps(body, indent=1, sort_keys=True, allow_nan=False))
     _flush(record_path)
@@ -158,7 +159,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
             f"checkpoint {path}: {RECORD_FILE} is damaged ({cut(str(error), 400)}); delete this folder to go on "
             "without it"
         ) from error
-    found = _file_digest(tensors_path)
+    found = sha256_of(tensors_path)
     if found != expected:
         raise CheckpointError(
             f"checkpoint {path}: {TENSORS_FILE} is damaged (SHA-256 {found[:12]}..., {expected[:12]}... was written; "
@@ -260,11 +261,6 @@ def _added_settings(value: object, prefix: str = "") -> Iterator[tuple[str, obje
 def _steps(folder: Path) -> list[int]:
     """Steps of the checkpoints in ``folder``, oldest first."""
     return sorted(int(path.name.removeprefix("step_")) for path in folder.glob("step_[0-9]*") if path.is_dir())
-
-
-def _file_digest(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _flush(path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Recipe fingerprints: SHA-256 of canonical JSON (docs/pipeline.md), and digests of files.
+"""Recipe fingerprints: SHA-256 of canonical JSON (docs/pipeline.md).
 
 A fingerprint names a *recipe* (what would be computed), so the keys of a whole graph are known before anything runs.
 """
@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from pathlib import Path
 
 from rtgs.core.recipe import canonical_json
 
@@ -16,12 +15,6 @@ from rtgs.core.recipe import canonical_json
 def fingerprint(value: object) -> str:
     """64 hexadecimal digits: SHA-256 of the canonical JSON of a recipe."""
     return hashlib.sha256(canonical_json(value).encode()).hexdigest()
-
-
-def file_digest(path: Path) -> str:
-    """SHA-256 of the bytes of a file, 64 hexadecimal digits."""
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def flatten(value: object, prefix: str = "") -> dict[str, object]:

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from rtgs.core.documents import load_json
+from rtgs.core.files import sha256_of
 from rtgs.core.version import VERSION
-from rtgs.workflow.fingerprint import file_digest
 from rtgs.workflow.step import Step
 
 NAME = "manifest.json"
@@ -92,7 +92,7 @@ def describe(step: Step, folder: Path, duration: float, created: str, cpu_second
         upstream={other.name: other.fingerprint for other in step.upstream},
         tools=dict(step.tools),
         files={
-            path.relative_to(folder).as_posix(): FileRecord(path.stat().st_size, file_digest(path))
+            path.relative_to(folder).as_posix(): FileRecord(path.stat().st_size, sha256_of(path))
             for path in sorted(folder.rglob("*"))
             if path.is_file() and path != folder / NAME
         },

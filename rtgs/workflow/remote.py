@@ -23,8 +23,8 @@ from typing import Any
 from rtgs.core.credentials import hide, redact
 from rtgs.core.documents import load_json, parse_json
 from rtgs.core.errors import RtgsError
+from rtgs.core.files import sha256_of
 from rtgs.workflow import manifest as manifests
-from rtgs.workflow.fingerprint import file_digest
 from rtgs.workflow.manifest import Manifest
 from rtgs.workflow.store import Artifact, Store
 
@@ -162,7 +162,7 @@ class RemoteStore:
                 target = attempt / _inside(file, self.redacted)
                 target.parent.mkdir(parents=True, exist_ok=True)
                 self._download(f"{source}/{file}", target)
-                if target.stat().st_size != record.size or file_digest(target) != record.sha256:
+                if target.stat().st_size != record.size or sha256_of(target) != record.sha256:
                     raise RemoteStoreError(
                         f"{self.redacted}: {name}/{fingerprint[:12]}/{file} is not what its manifest says; delete the "
                         "artifact there, the next run makes it again"

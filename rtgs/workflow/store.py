@@ -24,8 +24,8 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from rtgs.core.errors import RtgsError
+from rtgs.core.files import sha256_of
 from rtgs.workflow import manifest as manifests
-from rtgs.workflow.fingerprint import file_digest
 from rtgs.workflow.manifest import Manifest
 from rtgs.workflow.step import Step
 
@@ -232,7 +232,7 @@ def _defects(folder: Path, manifest: Manifest) -> list[str]:
     for name, record in manifest.files.items():
         if not (folder / name).is_file():
             defects.append(f"{name} is missing")
-        elif file_digest(folder / name) != record.sha256:
+        elif sha256_of(folder / name) != record.sha256:
             defects.append(f"{name} has changed since it was made")
     present = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
     defects += [f"{name} is not in the manifest" for name in sorted(present - set(manifest.files) - {manifests.NAME})]

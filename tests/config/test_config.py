@@ -20,10 +20,10 @@ from recipes import TRAINED
 from pipelines.planning.graph import build_graph
 from pipelines.planning.inspection import Inspections
 from rtgs.config import RunConfig, compose
-from rtgs.config.compose import VERSION_BASE
 from rtgs.config.convert import derive_name, to_run_config
 from rtgs.config.explain import explain
 from rtgs.config.locate import choices_of, conf_dir
+from rtgs.config.opened import VERSION_BASE
 from rtgs.config.schema import Choices, open_schema, register_schema
 from rtgs.config.sweep import compose_jobs
 from rtgs.core.build import build

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from rtgs.gaussians.channels import Channel
+from rtgs.gaussians.primitives import in_sphere
 from rtgs.gaussians.surfels import ActivatedGaussians
 from rtgs.light.feature_network import SURFACE
 from rtgs.methods.parts.base import BaseSet, composited
@@ -103,8 +104,7 @@ class FeatureMirror(Part):
 
     def paint(self, frame: Frame, rows: ActivatedGaussians) -> Tensor:
         """(N, 12) SH colour, channels, and whether the centre is inside the sphere."""
-        center = torch.tensor(self._own.scope_center)
-        inside = (rows.means.detach() - center).square().sum(1) <= self._own.scope_radius**2
+        inside = in_sphere(rows.means.detach(), self._own.scope_center, self._own.scope_radius)
         return torch.cat((composited(self.base.set.gaussians, rows.colors), inside[:, None].float()), dim=1)
 
     def shade(self, frame: Frame, raster: Raster) -> RenderedView | None:

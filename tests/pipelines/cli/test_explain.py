@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from pipelines.cli.explain import keys_of, one_key
@@ -187,3 +189,52 @@ def test_help_of_run_is_a_screen(capsys):
     assert len(lines) <= 40
     for text in ("method: 2dgs", "rtgs run /my/capture", "preset: ", "rtgs explain"):
         assert any(text in line for line in lines)
+
+
+@pytest.fixture
+def own_configs(tmp_path: Path) -> Path:
+    """A folder of YAML files as a user has one."""
+    folder = tmp_path / "mine"
+    (folder / "ablation").mkdir(parents=True)
+    text = "# @package _global_\nablation:\n  why: half of it\nmethod:\n  loss:\n    dssim: 0.125\n"
+    (folder / "ablation" / "half.yaml").write_text(text, encoding="utf-8")
+    return folder
+
+
+@pytest.mark.parametrize("option", ["--config-dir {}", "--config-dir={}", "-cd {}"])
+def test_explain_and_plan_know_the_files_of_a_folder_of_ones_own(own_configs: Path, option: str, capsys):
+    words = [*option.format(own_configs).split(" "), "ablation=half", "scene=demo"]
+    assert main(["explain", "method.loss.dssim", *words]) == 0
+    said = capsys.readouterr().out
+    assert "0.125" in said
+    assert f"{own_configs}/ablation/half.yaml" in said.replace("\n", "").replace(" " * 11, "")
+    assert main(["plan", *words[-2:], *words[:-2]]) == 0
+    assert "8 steps" in capsys.readouterr().out
+    assert main(["plan", "ablation=half", "scene=demo"]) == 1
+    assert "half" in capsys.readouterr().err
+
+
+def test_a_folder_that_is_none_is_refused(capsys):
+    for words in (["plan", "--config-dir", "/no/such"], ["explain", "--config-dir=/no/such"]):
+        assert main(words) == 1
+        assert "--config-dir /no/such is no folder" in capsys.readouterr().err
+    assert main(["plan", "scene=demo", "--config-dir"]) == 1
+    assert "--config-dir needs a folder of YAML files" in capsys.readouterr().err
+
+
+def test_a_variable_that_is_not_set_is_named(monkeypatch: pytest.MonkeyPatch, capsys):
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    assert main(["plan", "scene=demo", "tracking=server"]) == 1
+    assert (
+        "tracking.uri is taken from the environment variable MLFLOW_TRACKING_URI, which is not set: set it, or give "
+        in (capsys.readouterr().err)
+    )
+
+
+def test_help_lists_groups_that_can_be_chosen(capsys):
+    assert main(["run", "--help"]) == 0
+    said = capsys.readouterr().out
+    assert "\nablation: " in said
+    assert "\npreset: " in said
+    assert "after_preset" not in said
+    assert "figure: " not in said
