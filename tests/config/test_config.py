@@ -42,7 +42,7 @@ SCENES = [name for name in choices_of("scene") if name != "capture"]
 def conf_copy(tmp_path, monkeypatch) -> Path:
     """A copy of conf/ that a test may spoil."""
     shutil.copytree(conf_dir(), tmp_path / "conf")
-    monkeypatch.setattr(sys.modules["rtgs.config.compose"], "conf_dir", lambda: tmp_path / "conf")
+    monkeypatch.setattr("rtgs.config.opened.conf_dir", lambda: tmp_path / "conf")
     return tmp_path / "conf"
 
 

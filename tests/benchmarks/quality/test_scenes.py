@@ -18,7 +18,7 @@ def test_there_are_some_and_none_has_the_name_of_a_shipped_one():
 
 
 @pytest.mark.parametrize("path", SCENES, ids=lambda path: path.stem)
-def test_each_can_be_made_and_has_glass(path: Path):
+def test_each_can_be_made_and_has_glass_or_mirrors(path: Path):
     found = read_description(path)
-    assert any(shape.material.kind == "thin_glass" for shape in found.shapes)
+    assert {shape.material.kind for shape in found.shapes} & {"thin_glass", "mirror"}
     assert len({shape.name for shape in found.shapes}) == len(found.shapes)
