@@ -5,6 +5,8 @@
 #include <nanobind/stl/string.h>
 
 #include <cstdint>
+#include <stdexcept>
+#include <string>
 
 namespace nb = nanobind;
 
@@ -17,6 +19,17 @@ struct Floats : FloatArray {
   Floats() = default;
   explicit Floats(const FloatArray& array) : FloatArray(array) {}
 };
+
+// Tables are made once and kept read-only.
+using Table = nb::ndarray<const int32_t, nb::c_contig, nb::device::cpu>;
+
+// An array of `kernel`'s that does not hold `size` numbers is a ValueError.
+template <typename Array>
+void require(const char* kernel, const Array& a, const char* name, int64_t size) {
+  if (int64_t(a.size()) != size)
+    throw std::invalid_argument(std::string(kernel) + ": " + name + " holds " + std::to_string(a.size()) +
+                                " numbers, expected " + std::to_string(size));
+}
 
 void bind_isa(nb::module_& m);
 void bind_memory(nb::module_& m);

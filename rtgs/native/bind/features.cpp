@@ -1,6 +1,3 @@
-#include <stdexcept>
-#include <string>
-
 #include "bind/bindings.h"
 #include "common/isa.h"
 #include "common/threads.h"
@@ -9,14 +6,7 @@
 namespace rtgs {
 namespace {
 
-using Table = nb::ndarray<const int32_t, nb::c_contig, nb::device::cpu>;
-
-template <typename Array>
-void require(const Array& a, const char* name, int64_t size) {
-  if (int64_t(a.size()) != size)
-    throw std::invalid_argument(std::string("feature light: ") + name + " holds " + std::to_string(a.size()) +
-                                " numbers, expected " + std::to_string(size));
-}
+const char* const kFeatures = "feature light";
 
 FeatureMap map_of(const Floats& texels, const Table& sides) {
   if (sides.size() < 2 || sides.size() > size_t(kMaxMapLevels))
@@ -32,7 +22,7 @@ FeatureMap map_of(const Floats& texels, const Table& sides) {
     map.start[k] = start;
     start += 2 * side * side;
   }
-  require(texels, "texels", kDirection * start);
+  require(kFeatures, texels, "texels", kDirection * start);
   return map;
 }
 
@@ -48,22 +38,37 @@ FeatureNetwork network_of(const nb::tuple& packed) {
                             width, width, kColors};
   const char* names[9] = {"first", "second", "last", "first_t", "second_t", "last_t", "first_bias", "second_bias",
                           "last_bias"};
-  for (int k = 0; k < 9; ++k) require(arrays[k], names[k], sizes[k]);
+  for (int k = 0; k < 9; ++k) require(kFeatures, arrays[k], names[k], sizes[k]);
   return {int(width), arrays[0].data(), arrays[1].data(), arrays[2].data(), arrays[3].data(), arrays[4].data(),
           arrays[5].data(), arrays[6].data(), arrays[7].data(), arrays[8].data()};
 }
 
 FeatureRays rays_of(const Floats& directions, const Floats& level, const Floats& surface, int threads) {
   const int64_t count = int64_t(level.size());
-  require(directions, "directions", 3 * count);
-  require(surface, "surface", kSurface * count);
+  require(kFeatures, directions, "directions", 3 * count);
+  require(kFeatures, surface, "surface", kSurface * count);
   return {count, directions.data(), level.data(), surface.data(), checked_threads(threads)};
 }
 
-FeatureSaved saved_of(const Floats& found, const Floats& places, int64_t count) {
-  require(found, "found", kDirection * count);
-  require(places, "places", 2 * count);
-  return {found.data(), places.data()};
+// What both directions read, and where they work.
+struct Given {
+  FeatureMap map;
+  FeatureNetwork net;
+  FeatureRays rays;
+  FeatureSaved saved;
+  float* work;
+};
+
+Given given_of(const Floats& texels, const Table& sides, const nb::tuple& network, const Floats& directions,
+               const Floats& level, const Floats& surface, const Floats& scratch, const Floats& found,
+               const Floats& places, int threads) {
+  const FeatureMap map = map_of(texels, sides);
+  const FeatureNetwork net = network_of(network);
+  const FeatureRays rays = rays_of(directions, level, surface, threads);
+  require(kFeatures, found, "found", kDirection * rays.count);
+  require(kFeatures, places, "places", 2 * rays.count);
+  require(kFeatures, scratch, "scratch", kFeatureChunks * feature_scratch(net.width));
+  return {map, net, rays, {found.data(), places.data()}, scratch.data()};
 }
 
 }  // namespace
@@ -75,38 +80,32 @@ void bind_features(nb::module_& m) {
   m.def("feature_weights", &feature_weights, nb::arg("width"), "Floats of the gradient of a network, one chunk.");
   m.def("feature_light", [](Floats texels, Table sides, nb::tuple network, Floats directions, Floats level,
                             Floats surface, Floats scratch, Floats found, Floats places, Floats color, int threads) {
-    const FeatureMap map = map_of(texels, sides);
-    const FeatureNetwork net = network_of(network);
-    const FeatureRays rays = rays_of(directions, level, surface, threads);
-    const FeatureSaved saved = saved_of(found, places, rays.count);
-    require(scratch, "scratch", kFeatureChunks * feature_scratch(net.width));
-    require(color, "color", 3 * rays.count);
-    float *work = scratch.data(), *out = color.data();
+    const Given given =
+        given_of(texels, sides, network, directions, level, surface, scratch, found, places, threads);
+    require(kFeatures, color, "color", 3 * given.rays.count);
+    float* out = color.data();
     nb::gil_scoped_release release;
-    RTGS_DISPATCH(feature_light, map, net, rays, work, saved, out);
+    RTGS_DISPATCH(feature_light, given.map, given.net, given.rays, given.work, given.saved, out);
   }, nb::arg("texels"), nb::arg("sides"), nb::arg("network"), nb::arg("directions"), nb::arg("level"),
      nb::arg("surface"), nb::arg("scratch"), nb::arg("found"), nb::arg("places"), nb::arg("color"), nb::arg("threads"),
      "Fills color (P, 3), found (P, 16) and places (P, 2); see rtgs/light/feature_network.py.");
   m.def("feature_light_backward", [](Floats texels, Table sides, nb::tuple network, Floats directions, Floats level,
                                      Floats surface, Floats scratch, Floats found, Floats places, Floats upstream,
                                      nb::tuple gradients, int threads) {
-    const FeatureMap map = map_of(texels, sides);
-    const FeatureNetwork net = network_of(network);
-    const FeatureRays rays = rays_of(directions, level, surface, threads);
-    const FeatureSaved saved = saved_of(found, places, rays.count);
-    require(scratch, "scratch", kFeatureChunks * feature_scratch(net.width));
-    require(upstream, "upstream", 3 * rays.count);
+    const Given given =
+        given_of(texels, sides, network, directions, level, surface, scratch, found, places, threads);
+    require(kFeatures, upstream, "upstream", 3 * given.rays.count);
     if (gradients.size() != 6) throw std::invalid_argument("feature light: there are 6 arrays of gradients");
     Floats to[6];
     for (int k = 0; k < 6; ++k) to[k] = nb::cast<Floats>(gradients[k], false);
-    const int64_t sizes[6] = {int64_t(texels.size()), 3 * rays.count, rays.count, kSurface * rays.count,
-                              kFeatureChunks * feature_weights(net.width), kDirection * rays.count};
-    for (int k = 0; k < 6; ++k) require(to[k], "a gradient", sizes[k]);
+    const int64_t count = given.rays.count;
+    const int64_t sizes[6] = {int64_t(texels.size()), 3 * count, count, kSurface * count,
+                              kFeatureChunks * feature_weights(given.net.width), kDirection * count};
+    for (int k = 0; k < 6; ++k) require(kFeatures, to[k], "a gradient", sizes[k]);
     const FeatureGradients out = {to[0].data(), to[1].data(), to[2].data(), to[3].data(), to[4].data(), to[5].data()};
-    float* work = scratch.data();
     const float* from = upstream.data();
     nb::gil_scoped_release release;
-    RTGS_DISPATCH(feature_light_backward, map, net, rays, work, saved, from, out);
+    RTGS_DISPATCH(feature_light_backward, given.map, given.net, given.rays, given.work, given.saved, from, out);
   }, nb::arg("texels"), nb::arg("sides"), nb::arg("network"), nb::arg("directions"), nb::arg("level"),
      nb::arg("surface"), nb::arg("scratch"), nb::arg("found"), nb::arg("places"), nb::arg("upstream"),
      nb::arg("gradients"), nb::arg("threads"),

@@ -1,6 +1,3 @@
-#include <stdexcept>
-#include <string>
-
 #include "bind/bindings.h"
 #include "common/isa.h"
 #include "common/threads.h"
@@ -9,17 +6,10 @@
 namespace rtgs {
 namespace {
 
-// Tables are made once and kept read-only.
-using Table = nb::ndarray<const int32_t, nb::c_contig, nb::device::cpu>;
+const char* const kCubemap = "cubemap";
+
 using LongTable = nb::ndarray<const int64_t, nb::c_contig, nb::device::cpu>;
 using FloatTable = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
-
-template <typename Array>
-void require(const Array& a, const char* name, int64_t size) {
-  if (int64_t(a.size()) != size)
-    throw std::invalid_argument(std::string("cubemap: ") + name + " holds " + std::to_string(a.size()) +
-                                " numbers, expected " + std::to_string(size));
-}
 
 CubePyramid pyramid_of(const Floats& padded, const Table& sides) {
   if (sides.size() < 1 || sides.size() > size_t(kMaxCubeLevels))
@@ -35,14 +25,14 @@ CubePyramid pyramid_of(const Floats& padded, const Table& sides) {
     pyramid.start[k] = int32_t(start);
     start += 6 * (side + 2) * (side + 2);
   }
-  require(padded, "padded texels", 4 * start);
+  require(kCubemap, padded, "padded texels", 4 * start);
   return pyramid;
 }
 
 CubeRays rays_of(const Floats& directions, const Floats& level, int levels, int threads) {
   const int64_t count = int64_t(directions.size() / 3);
-  require(directions, "directions", 3 * count);
-  if (levels > 1) require(level, "level", count);
+  require(kCubemap, directions, "directions", 3 * count);
+  if (levels > 1) require(kCubemap, level, "level", count);
   return {count, directions.data(), levels > 1 ? level.data() : nullptr, checked_threads(threads)};
 }
 
@@ -54,14 +44,14 @@ CubeBorder border_of(const Table& source, const Table& corners) {
 
 void bind_light(nb::module_& m) {
   m.def("cube_pad", [](Table source, Table corners, Floats texels, Floats padded) {
-    require(padded, "padded texels", 4 * int64_t(source.size()));
+    require(kCubemap, padded, "padded texels", 4 * int64_t(source.size()));
     const CubeBorder border = border_of(source, corners);
     nb::gil_scoped_release release;
     cube_pad(border, texels.data(), padded.data());
   }, nb::arg("source"), nb::arg("corners"), nb::arg("texels"), nb::arg("padded"),
      "Fills faces with a border (Q, 4) from texels (T, 3); see rtgs/light/faces.py.");
   m.def("cube_fold", [](Table source, Table corners, Floats padded, Floats texels) {
-    require(padded, "padded texels", 4 * int64_t(source.size()));
+    require(kCubemap, padded, "padded texels", 4 * int64_t(source.size()));
     const CubeBorder border = border_of(source, corners);
     nb::gil_scoped_release release;
     cube_fold(border, padded.data(), int64_t(texels.size() / 3), texels.data());
@@ -70,7 +60,7 @@ void bind_light(nb::module_& m) {
   m.def("cube_lookup", [](Floats padded, Table sides, Floats directions, Floats level, Floats color, int threads) {
     const CubePyramid pyramid = pyramid_of(padded, sides);
     const CubeRays rays = rays_of(directions, level, pyramid.levels, threads);
-    require(color, "color", 3 * rays.count);
+    require(kCubemap, color, "color", 3 * rays.count);
     float* out = color.data();
     nb::gil_scoped_release release;
     RTGS_DISPATCH(cube_lookup, pyramid, rays, out);
@@ -80,10 +70,10 @@ void bind_light(nb::module_& m) {
                                    Floats to_padded, Floats to_directions, Floats to_level, int threads) {
     const CubePyramid pyramid = pyramid_of(padded, sides);
     const CubeRays rays = rays_of(directions, level, pyramid.levels, threads);
-    require(upstream, "upstream", 3 * rays.count);
-    require(to_padded, "gradient of texels", int64_t(padded.size()));
-    require(to_directions, "gradient of directions", 3 * rays.count);
-    if (rays.level) require(to_level, "gradient of level", rays.count);
+    require(kCubemap, upstream, "upstream", 3 * rays.count);
+    require(kCubemap, to_padded, "gradient of texels", int64_t(padded.size()));
+    require(kCubemap, to_directions, "gradient of directions", 3 * rays.count);
+    if (rays.level) require(kCubemap, to_level, "gradient of level", rays.count);
     const CubeGradients out = {to_padded.data(), to_directions.data(), rays.level ? to_level.data() : nullptr};
     const float* from = upstream.data();
     nb::gil_scoped_release release;
@@ -94,13 +84,13 @@ void bind_light(nb::module_& m) {
   m.def("cube_filter", [](Table texel, LongTable start, Table column, FloatTable weight, Table images,
                           FloatTable before, FloatTable after, Floats x, Floats spread, Floats y, int threads) {
     const int64_t texels = int64_t(before.size()), rows = int64_t(texel.size());
-    require(start, "start", rows + 1);
-    require(weight, "weight", int64_t(column.size()));
-    require(images, "images", 8 * texels);
-    require(after, "after", texels);
-    require(x, "x", 3 * texels);
-    require(spread, "spread", 32 * texels);
-    require(y, "y", 3 * texels);
+    require(kCubemap, start, "start", rows + 1);
+    require(kCubemap, weight, "weight", int64_t(column.size()));
+    require(kCubemap, images, "images", 8 * texels);
+    require(kCubemap, after, "after", texels);
+    require(kCubemap, x, "x", 3 * texels);
+    require(kCubemap, spread, "spread", 32 * texels);
+    require(kCubemap, y, "y", 3 * texels);
     const CubeFilter filter = {texels, rows, texel.data(), start.data(), column.data(), weight.data(), images.data(),
                                before.data(), after.data(), checked_threads(threads)};
     const float* from = x.data();
