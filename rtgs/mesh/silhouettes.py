@@ -16,6 +16,8 @@ from rtgs.mesh.guide import MeshGuide
 from rtgs.mesh.settings import COVERED
 from rtgs.mesh.triangles import TriangleMesh
 
+_MOST_REACHES = 0.9  # quantile
+
 
 def bounding(mask: Tensor | None) -> Tensor | None:
     """The mask, or None for one that covers the whole picture: it tells object from scene no better than no mask."""
@@ -168,3 +170,25 @@ def direction_spread(views: Sequence[MaskView]) -> float:
     away = np.stack([view.camera.center.numpy() for view in views]) - point
     unit = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
     return float(np.degrees(np.arccos(np.clip((unit @ unit.T).min(), -1, 1))))
+
+
+def enclosing_sphere(views: Sequence[MaskView]) -> tuple[np.ndarray, float]:
+    """Centre (3,) float64 and radius, world units, of a sphere around what the masks show.
+
+    The centre is :func:`focus_point`. The farthest ray of a mask's pixels is as far from it as the object reaches in
+    that view; the radius is the 90th percentile over the views, so that a few broken masks do not blow it up. Views in
+    which the object reaches the image border count only where it does so in all.
+    """
+    center = focus_point(views)
+    whole = [view for view in views if not view.cut] or list(views)
+    return center, float(np.quantile([_reach(view, center) for view in whole], _MOST_REACHES))
+
+
+def _reach(view: MaskView, point: np.ndarray) -> float:
+    """The distance from ``point`` to the farthest of the rays through the mask's pixels."""
+    rays = view.camera.rays(torch.float64)
+    directions = rays.directions[view.mask].numpy()
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    offset = point - rays.origin.numpy()
+    along = np.clip(directions @ offset, 0, None)
+    return float(np.linalg.norm(offset - along[:, None] * directions, axis=1).max())

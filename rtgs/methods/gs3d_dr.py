@@ -9,8 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
-from rtgs.core.refuse import refuse_bad_numbers, refuse_bad_point, refuse_outside, refuse_unknown_words, refuse_unless
+from rtgs.core.refuse import refuse_bad_numbers, refuse_outside, refuse_unless
 from rtgs.methods.family import cubemap_stages, guided
+from rtgs.methods.scope import ScopeSettings
 from rtgs.methods.spec import HARMONICS, MethodSpec
 
 if TYPE_CHECKING:
@@ -19,26 +20,23 @@ if TYPE_CHECKING:
     from rtgs.methods.model import Model
     from rtgs.methods.parts.base import BaseSet
     from rtgs.methods.spec import Setup
+    from rtgs.scenes.scene import Scene
     from rtgs.train.terms import LossTerm
 
 
 @dataclass(frozen=True)
-class DeferredSettings:
-    """The keys ``method.own.<name>``."""
+class DeferredSettings(ScopeSettings):
+    """The keys ``method.own.<name>``. Outside of the scope nothing is to reflect."""
 
     primitive: Literal["ellipsoids", "surfels"] = "ellipsoids"  # published: ellipsoids
     weight_floor: float = 0.001  # m is raised to it at resets of opacities
-    # A sphere in the world frame, outside of which nothing is to reflect: published for each real scene, by hand.
-    scope_radius: float = 0.0  # 0: none
-    scope_center: tuple[float, ...] = (0.0, 0.0, 0.0)
-    outside: float = 0.4  # weight of the mean m of all Gaussians outside it
+    outside: float = 0.4  # weight of the mean m of all Gaussians outside of the scope
 
     def __post_init__(self) -> None:
-        refuse_unknown_words(self, "method.own")
+        super().__post_init__()
         refuse_bad_numbers(self, "method.own")
         refuse_outside(self, "method.own", 0, 1, "weight_floor", open_low=True)
         refuse_unless(self.weight_floor < 1, "method.own.weight_floor", self.weight_floor, "below 1")
-        refuse_bad_point(self.scope_center, "method.own.scope_center")
 
 
 def build(setup: Setup) -> Model:
@@ -60,24 +58,25 @@ def build(setup: Setup) -> Model:
         refuse_surface_losses(setup.settings, ("normal", "distortion"))
     base = BaseSet(setup, SURFELS if surfels else ELLIPSOIDS)
     mirror = CubemapMirror(setup, base, own.weight_floor)
-    terms = (*surface_terms(setup), *mcmc_terms(base, setup), *scope_terms(base, own))
+    terms = (*surface_terms(setup), *mcmc_terms(base, setup), *scope_terms(base, own, setup.scene))
     return Model(setup, (base, mirror), terms)
 
 
-def scope_terms(base: BaseSet, own: DeferredSettings) -> Sequence[LossTerm]:
-    """The mean m of the Gaussians whose centres are outside the scope, where there is one."""
-    from rtgs.gaussians.primitives import in_sphere
+def scope_terms(base: BaseSet, own: DeferredSettings, scene: Scene) -> Sequence[LossTerm]:
+    """The mean m of the Gaussians whose centres are outside of the scope, where there is one."""
     from rtgs.methods.parts.cubemap_mirror import WEIGHT
+    from rtgs.methods.scope import scope_of
     from rtgs.train.terms import LossTerm
 
-    if own.scope_radius == 0 or own.outside == 0:
+    scope = scope_of(own, scene) if own.outside > 0 else None
+    if scope is None:
         return ()
 
     def outside(rendered: object, view: object) -> Tensor | None:
         gaussians = base.set.gaussians
         if WEIGHT not in gaussians:
             return None
-        far = ~in_sphere(gaussians.means.detach(), own.scope_center, own.scope_radius)
+        far = ~scope.holds(gaussians.means.detach())
         return gaussians.activated(WEIGHT)[far].mean() if bool(far.any()) else None
 
     return (LossTerm("outside", own.outside, outside),)

@@ -10,8 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from rtgs.core.refuse import refuse_bad_counts, refuse_bad_point, refuse_outside, refuse_unless
+from rtgs.core.refuse import refuse_bad_counts, refuse_outside, refuse_unless
 from rtgs.methods.family import cubemap_stages, guided
+from rtgs.methods.scope import ScopeSettings
 from rtgs.methods.spec import HARMONICS, SURFACE, MethodSpec
 
 if TYPE_CHECKING:
@@ -26,8 +27,11 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class FeatureSettings:
-    """The keys ``method.own.<name>``. Defaults are those of the published code for real scenes."""
+class FeatureSettings(ScopeSettings):
+    """The keys ``method.own.<name>``. Defaults are those of the published code for real scenes.
+
+    Outside of the scope SH colours stand; without one everything is inside.
+    """
 
     width: int = 0  # of the network's hidden layers; 0: half of environment.side, 256 of 512
     network_rate: float = 5e-4
@@ -37,17 +41,14 @@ class FeatureSettings:
     # large, which Adam does not forget, and they stand still.
     feature_noise: float = 0.01
     opacity_entropy: float = 1e-3  # weight
-    # A sphere in the world frame, outside of which SH colours stand: published for each real scene, by hand.
-    scope_radius: float = 0.0  # 0: none, everything is inside
-    scope_center: tuple[float, ...] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         refuse_bad_counts(self, "method.own")
         refuse_unless(self.width <= 1024, "method.own.width", self.width, "at most 1024")
         refuse_outside(self, "method.own", 0, math.inf, "network_rate", "albedo_gain", open_low=True)
-        refuse_outside(self, "method.own", 0, math.inf, "feature_noise", "opacity_entropy", "scope_radius")
+        refuse_outside(self, "method.own", 0, math.inf, "feature_noise", "opacity_entropy")
         refuse_unless(-12 < self.albedo < 5, "method.own.albedo", self.albedo, "between -12 and 5")
-        refuse_bad_point(self.scope_center, "method.own.scope_center")
 
 
 def build(setup: Setup) -> Model:
@@ -73,7 +74,7 @@ def build(setup: Setup) -> Model:
 
 
 def feature_terms(base: BaseSet, own: FeatureSettings, setup: Setup) -> Sequence[LossTerm]:
-    """Opacities near 0 or 1, and where there is a sphere the SH colours outside of it."""
+    """Opacities near 0 or 1, and where there is a scope the SH colours outside of it."""
     from rtgs.methods.parts.feature_mirror import OUTSIDE, SH_IMAGE
     from rtgs.methods.plans import reflection_plan
     from rtgs.train.coverage_losses import opacity_entropy
@@ -95,7 +96,7 @@ def feature_terms(base: BaseSet, own: FeatureSettings, setup: Setup) -> Sequence
 
     terms = (
         ("opacity_entropy", own.opacity_entropy, entropy),
-        ("outside", float(own.scope_radius > 0), outside),
+        ("outside", float(own.scoped), outside),
     )
     return [LossTerm(name, weight, value, start) for name, weight, value in terms if weight > 0]
 

@@ -201,7 +201,7 @@ def test_the_scope_pulls_down_what_is_outside_alone():
         ({"primitive": "meshes"}, "method.own.primitive"),
         ({"weight_floor": 1.0}, "method.own.weight_floor"),
         ({"scope_center": [1.0]}, "method.own.scope_center"),
-        ({"scope": 1.0}, "method.own.scope is no key"),
+        ({"sphere": 1.0}, "method.own.sphere is no key"),
     ],
 )
 def test_keys_that_make_no_sense_are_refused(own: dict, message: str):

@@ -1,7 +1,7 @@
-"""The shading of Ref-GS (Zhang et al., CVPR 2025): albedo and mirrored light are added as linear light, in a sphere.
+"""The shading of Ref-GS (Zhang et al., CVPR 2025): albedo and mirrored light are added as linear light, in a scope.
 
-Inside the sphere the image is encoded(albedo + light(mirror direction, roughness, features)), outside it is that of the
-SH colours; both are weighted with how much of a pixel lies inside and outside. Without a sphere everything is inside.
+Inside of the scope the image is encoded(albedo + light(mirror direction, roughness, features)), outside of it is that
+of the SH colours; both are weighted with how much of a pixel lies inside and outside. Without one everything is inside.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ import torch
 from torch import Tensor
 
 from rtgs.gaussians.channels import Channel
-from rtgs.gaussians.primitives import in_sphere
 from rtgs.gaussians.surfels import ActivatedGaussians
 from rtgs.light.feature_network import SURFACE
 from rtgs.methods.parts.base import BaseSet, composited
 from rtgs.methods.parts.feature_light import FeatureLight, LearnedLight
 from rtgs.methods.parts.part import Frame, Part, Raster
 from rtgs.methods.plans import reflection_plan
+from rtgs.methods.scope import Scope, scope_of
 from rtgs.methods.shading.deferred import mirror_directions
 from rtgs.optics.light import encoded
 from rtgs.train.method import RenderedView, RenderOptions, Stage, StepEvent
@@ -38,7 +38,11 @@ SH_IMAGE, OUTSIDE = "sh_image", "outside"  # maps: the image of the SH colours, 
 
 
 class FeatureMirror(Part):
-    """Albedo, roughness and features on the base set, and the light that they mirror, from their stage on."""
+    """Albedo, roughness and features on the base set, and the light that they mirror, from their stage on.
+
+    Attributes:
+        scope: what reflects; None: everything.
+    """
 
     name = "mirror"
 
@@ -50,6 +54,7 @@ class FeatureMirror(Part):
         self._stage = stage
         plan = reflection_plan(setup.settings.reflection, base.schedule)
         width = own.width or max(setup.settings.environment.side // 2, 8)
+        self.scope = scope_of(own, setup.scene)
         self.learned = LearnedLight(setup, plan.start, own.network_rate, width)
 
     @property
@@ -77,7 +82,9 @@ class FeatureMirror(Part):
                 raw += noise * torch.randn(raw.shape, generator=self.generator)
         self.learned.begin()
         side, count = self.settings.environment.side, len(self.learned.groups[1])
-        yield StepEvent("begin", self.name, f"a map of {side} x {2 * side} features, a network of {count:,} numbers")
+        where = "" if self.scope is None else f", in {self.scope}"
+        text = f"a map of {side} x {2 * side} features, a network of {count:,} numbers{where}"
+        yield StepEvent("begin", self.name, text)
 
     @property
     def channels(self) -> tuple[Channel, ...]:
@@ -94,8 +101,9 @@ class FeatureMirror(Part):
         )  # fmt: skip
 
     def _adopt(self) -> None:
-        self.base.set.adopt(self.base.set.gaussians.with_channels(*self.channels))
-        self.base.painter = self if self._own.scope_radius > 0 else None
+        if ALBEDO not in self.base.set.gaussians:
+            self.base.set.adopt(self.base.set.gaussians.with_channels(*self.channels))
+        self.base.painter = None if self.scope is None else self
 
     # ---- rendering
 
@@ -103,8 +111,9 @@ class FeatureMirror(Part):
         return RenderOptions(normal=bool(self.learned.groups))
 
     def paint(self, frame: Frame, rows: ActivatedGaussians) -> Tensor:
-        """(N, 12) SH colour, channels, and whether the centre is inside the sphere."""
-        inside = in_sphere(rows.means.detach(), self._own.scope_center, self._own.scope_radius)
+        """(N, 12) SH colour, channels, and whether the centre is inside of the scope."""
+        assert self.scope is not None
+        inside = self.scope.holds(rows.means.detach())
         return torch.cat((composited(self.base.set.gaussians, rows.colors), inside[:, None].float()), dim=1)
 
     def shade(self, frame: Frame, raster: Raster) -> RenderedView | None:
@@ -115,8 +124,8 @@ class FeatureMirror(Part):
         camera, buffers = frame.camera, raster.buffers
         assert buffers.normal is not None
         flat, alpha = buffers.features.flatten(1), buffers.alpha.flatten()
-        scoped = self._own.scope_radius > 0
-        # Both weights are constants, as published. Without a sphere the coverage must learn from the image.
+        scoped = self.scope is not None
+        # Both weights are constants, as published. Without a scope the coverage must learn from the image.
         inside = flat[11].detach() if scoped else alpha
         outside = (alpha.detach() - inside).clamp_min(0) if scoped else torch.zeros_like(alpha.detach())
         chosen = torch.nonzero(inside.detach() > LEAST_INSIDE)[:, 0]
@@ -143,10 +152,15 @@ class FeatureMirror(Part):
 
     # ---- state
 
+    def state(self) -> dict[str, Tensor]:
+        return self.scope.state() if self.learned.groups and self.scope is not None else {}
+
     def restore(self, state: Mapping[str, Tensor]) -> None:
-        """The channels and the light as the state has them."""
+        """The scope, the channels and the light as the state has them."""
         gaussians, there = self.base.set.gaussians, f"{self.base.name}.surfels.{ALBEDO}" in state
-        if there and ALBEDO not in gaussians:
+        if there:
+            if self._own.scope == "masks":
+                self.scope = Scope.of(state)
             self._adopt()
         elif not there and ALBEDO in gaussians:
             self.base.set.adopt(gaussians.without_channels(ALBEDO, ROUGHNESS, FEATURE))

@@ -1,0 +1,87 @@
+"""Where a method may reflect: a sphere in the world, typed by hand as published, or around what the masks show."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+from rtgs.core.refuse import refuse_bad_point, refuse_outside, refuse_unknown_words, refuse_unless
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from rtgs.scenes.scene import Scene
+
+_STATE = "scope"  # (4,) float64 centre and radius
+
+
+@dataclass(frozen=True)
+class ScopeSettings:
+    """Keys ``method.own.<name>`` of methods with a scope."""
+
+    scope: Literal["sphere", "masks"] = "sphere"  # masks: where the scene has none, there is no scope
+    scope_radius: float = 0.0  # world units, of the sphere; 0: no scope
+    scope_center: tuple[float, ...] = (0.0, 0.0, 0.0)  # world
+
+    def __post_init__(self) -> None:
+        refuse_unknown_words(self, "method.own")
+        refuse_outside(self, "method.own", 0, math.inf, "scope_radius")
+        refuse_bad_point(self.scope_center, "method.own.scope_center")
+        given = self.scope_radius if self.scope == "masks" else 0
+        refuse_unless(given == 0, "method.own.scope_radius", given, "0 with method.own.scope=masks")
+
+    @property
+    def scoped(self) -> bool:
+        """There may be a scope: masks are looked for when the model is made."""
+        return self.scope == "masks" or self.scope_radius > 0
+
+
+@dataclass(frozen=True)
+class Scope:
+    """A sphere."""
+
+    center: tuple[float, ...]
+    radius: float
+
+    def holds(self, points: Tensor) -> Tensor:
+        """(N,) bool of points (N, 3), world."""
+        from rtgs.gaussians.primitives import in_sphere
+
+        return in_sphere(points, self.center, self.radius)
+
+    def state(self) -> dict[str, Tensor]:
+        """For a checkpoint: pictures are made from other views than were trained on, whose masks are others."""
+        import torch
+
+        return {_STATE: torch.tensor([*self.center, self.radius], dtype=torch.float64)}
+
+    @staticmethod
+    def of(state: Mapping[str, Tensor]) -> Scope | None:
+        """That of :meth:`state`."""
+        if _STATE not in state:
+            return None
+        *center, radius = state[_STATE].tolist()
+        return Scope(tuple(center), radius)
+
+    def __str__(self) -> str:
+        x, y, z = self.center
+        return f"a sphere of {self.radius:.3g} around ({x:.3g}, {y:.3g}, {z:.3g})"
+
+
+def scope_of(settings: ScopeSettings, scene: Scene) -> Scope | None:
+    """The scope of a scene's training views; None: there is none.
+
+    Raises:
+        RtgsError: a mask does not fit its picture.
+    """
+    if settings.scope == "sphere":
+        return Scope(settings.scope_center, settings.scope_radius) if settings.scope_radius > 0 else None
+    from rtgs.mesh.silhouettes import enclosing_sphere, mask_set, why_unbounded
+
+    masks = [view.mask for view in scene.train]
+    if why_unbounded(masks):
+        return None
+    center, radius = enclosing_sphere(mask_set([view.camera for view in scene.train], masks).views)
+    return Scope(tuple(center.tolist()), radius)

@@ -1,0 +1,131 @@
+"""Where a method may reflect: the sphere typed by hand, and that around the masks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from rtgs.core.errors import RtgsError
+from rtgs.mesh.silhouettes import MaskView, enclosing_sphere
+from rtgs.methods import Mode
+from rtgs.methods.gs3d_dr import DeferredSettings
+from rtgs.methods.parts.cubemap_mirror import WEIGHT
+from rtgs.methods.ref_gs import FeatureSettings
+from rtgs.methods.scope import Scope, ScopeSettings, scope_of
+from tests.methods.reflective_cases import MirrorScene, new_method, recipe, schedule, tiny, train_all
+
+MIDDLE, RADIUS = (0.1, -0.05, 0.0), 0.4
+MASKS = {"scope": "masks"}
+
+
+def mask_of(camera, center=MIDDLE, radius=RADIUS) -> torch.Tensor:
+    """(H, W) bool: pixels whose ray passes the sphere."""
+    rays = camera.rays(torch.float64)
+    offset = torch.tensor(center, dtype=torch.float64) - rays.origin
+    along = rays.directions / rays.directions.norm(dim=-1, keepdim=True)
+    return (offset - (along @ offset)[..., None] * along).norm(dim=-1) <= radius
+
+
+def masked(made: MirrorScene | None = None, every: int = 1) -> MirrorScene:
+    made = made or tiny()
+    train = [
+        replace(view, mask=mask_of(view.camera) if k % every == 0 else None) for k, view in enumerate(made.scene.train)
+    ]
+    return replace(made, scene=replace(made.scene, train=type(made.scene.train)(train)))
+
+
+def test_the_sphere_around_masks_is_the_one_that_they_show():
+    views = [MaskView(view.camera, mask_of(view.camera)) for view in tiny().scene.train]
+    center, radius = enclosing_sphere(views)
+    pixel = float(np.median([np.linalg.norm(v.camera.center.numpy() - MIDDLE) / v.camera.fx for v in views]))
+    assert np.linalg.norm(center - MIDDLE) < pixel
+    assert radius == pytest.approx(RADIUS, abs=1.5 * pixel)
+
+
+def test_a_broken_mask_does_not_blow_it_up():
+    views = [MaskView(view.camera, mask_of(view.camera)) for view in tiny().scene.train] * 2
+    _, radius = enclosing_sphere(views)
+    broken = views[0].mask.clone()
+    broken[2, 2] = True
+    _, found = enclosing_sphere([MaskView(views[0].camera, broken), *views[1:]])
+    assert found < 1.3 * radius
+
+
+def test_views_that_cut_the_object_count_only_where_all_do():
+    views = [MaskView(view.camera, mask_of(view.camera)) for view in tiny().scene.train]
+    _, radius = enclosing_sphere(views)
+    cut = views[0].mask.clone()
+    cut[:, 0] = True
+    assert enclosing_sphere([MaskView(views[0].camera, cut), *views[1:]])[1] == pytest.approx(radius, rel=0.3)
+    every = [MaskView(view.camera, torch.cat((view.mask[:, 4:], view.mask[:, :4] | True), 1)) for view in views]
+    assert enclosing_sphere(every)[1] > 0
+
+
+def test_a_scene_without_masks_has_no_scope_and_a_typed_one_needs_none():
+    made = tiny()
+    assert scope_of(ScopeSettings(scope="masks"), made.scene) is None
+    assert scope_of(ScopeSettings(), masked(made).scene) is None
+    typed = scope_of(ScopeSettings(scope_radius=0.5, scope_center=(1.0, 0.0, 0.0)), made.scene)
+    assert typed is not None
+    assert typed == Scope((1.0, 0.0, 0.0), 0.5)
+    assert typed.holds(torch.tensor([[1.4, 0.0, 0.0], [0.4, 0.0, 0.0]])).tolist() == [True, False]
+
+
+@pytest.mark.parametrize("settings", [DeferredSettings, FeatureSettings])
+def test_masks_and_a_typed_sphere_exclude_each_other(settings):
+    assert not settings().scoped
+    with pytest.raises(RtgsError, match=r"method\.own\.scope_radius.*scope=masks"):
+        settings(scope="masks", scope_radius=0.5)
+    with pytest.raises(RtgsError, match=r"method\.own\.scope"):
+        settings(scope="auto")
+
+
+def test_ref_gs_shades_what_the_masks_enclose():
+    made = masked()
+    method = train_all(replace(recipe("ref_gs"), own=MASKS), made, schedule(opacity_reset_every=0))
+    state = method.state()
+    *center, radius = state["scope"].tolist()
+    assert np.linalg.norm(np.array(center) - MIDDLE) < 0.1
+    # Pictures are made with other training views, some of whose masks are missing, and must be the same.
+    again = new_method(method.settings, masked(every=3), schedule(opacity_reset_every=0))
+    again.load(state)
+    typed_own = {"scope_radius": radius, "scope_center": center}
+    typed = new_method(replace(method.settings, own=typed_own), tiny(), schedule(opacity_reset_every=0))
+    typed.load({name: value for name, value in state.items() if name != "scope"})
+    camera = made.scene.test[0].camera
+    with torch.no_grad():
+        shown = [each.render(camera, 60, Mode.EVALUATE).image for each in (method, again, typed)]
+    assert torch.equal(shown[0], shown[1])
+    assert torch.equal(shown[0], shown[2])
+
+
+def test_trained_without_masks_it_has_no_scope_where_there_are_some():
+    method = train_all(replace(recipe("ref_gs"), own=MASKS), tiny(), schedule(opacity_reset_every=0))
+    assert "scope" not in method.state()
+    again = new_method(method.settings, masked(), schedule(opacity_reset_every=0))
+    again.load(method.state())
+    camera = tiny().scene.test[0].camera
+    with torch.no_grad():
+        shown = [each.render(camera, 60, Mode.EVALUATE).image for each in (method, again)]
+    assert torch.equal(*shown)
+
+
+def test_3dgs_dr_pulls_down_what_the_masks_do_not_enclose():
+    made = masked()
+    plain = replace(recipe("3dgs_dr"), loss=replace(recipe().loss, normal=0.0))
+    method = train_all(replace(plain, own=MASKS), made, schedule(opacity_reset_every=0))
+    scope = scope_of(ScopeSettings(scope="masks"), made.scene)
+    assert scope is not None
+    view, gaussians = made.scene.train[0], method["base"].gaussians
+    far = ~scope.holds(gaussians.means.detach())
+    assert 0 < int(far.sum()) < len(far)
+    terms = method.losses(method.render(view.camera, 59, Mode.TRAIN), view, 59).terms
+    (outside,) = [term for term in terms if term.name == "outside"]
+    expected = gaussians[WEIGHT].detach()[far].sigmoid().mean()
+    assert outside.value == pytest.approx(float(expected), rel=1e-5)
+    bare = train_all(replace(plain, own=MASKS), tiny(), schedule(opacity_reset_every=0))
+    terms = bare.losses(bare.render(view.camera, 59, Mode.TRAIN), view, 59).terms
+    assert "outside" not in [term.name for term in terms]
