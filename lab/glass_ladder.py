@@ -150,10 +150,14 @@ GROUPS: dict[str, tuple[str, ...]] = {
 
 
 def _propagation(config: RunConfig) -> list[str]:
-    """EnvGS's normal propagation in the second stage: a twenty-fifth of the run apart, as rests of it in proportion."""
+    """EnvGS's normal propagation in the second stage: a twenty-fifth of the run apart, as rests of it in proportion.
+
+    No scene is on probation: normals wait for its end, and in short runs it ends where the third stage begins.
+    """
     words = {"every": max(1, config.schedule.total // 25), "hold_every": max(1, config.schedule.total // 125)}
     words |= {"until": config.method.transmittance.start, "densify_every": config.schedule.densify_every}
-    return [f"method.reflection.propagation.{key}={value}" for key, value in words.items()]
+    chosen = [f"method.reflection.propagation.{key}={value}" for key, value in words.items()]
+    return [*chosen, "method.reflection.matte.probation=0"]
 
 
 def _masked_gain(config: RunConfig) -> float:

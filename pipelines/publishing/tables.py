@@ -45,7 +45,7 @@ def write_experiment_table(runs: Sequence[tuple[RunConfig, Sequence[StepResult]]
         evaluation = evaluation_of(results)
         scene = one.scene.name  # not the table's name of it, which says what is a stand-in
         differs = ways_of(one, evaluation.facts.method, results) if config.table.data == PAPER_DATA else ()
-        measured.append(Measured(evaluation, one.seed, names.get(scene, scene), _mesh_seconds(results), differs))
+        measured.append(Measured(evaluation, one.seed, names.get(scene, scene), differs))
     preset = measured[0].evaluation.facts.preset
     spec = TableSpec(config.table.name, config.table.title or config.table.name, config.table.data, config.table.blocks)
     folder = f"{config.table.name}-{preset}" + ("-papers_data" if spec.data == PAPER_DATA else "")
@@ -64,13 +64,6 @@ def _without_echoes(
             kept.append((config, results))
         seen.add(place)
     return kept
-
-
-def _mesh_seconds(results: Sequence[StepResult]) -> float:
-    """Of the mesh that a stage of the training waited for; 0: none did."""
-    trained = [result.step for result in results if result.step.name.startswith("train_")]
-    awaited = {step.fingerprint for each in trained for step in each.upstream if step.name == "extract_mesh"}
-    return sum(result.duration for result in results if result.step.fingerprint in awaited)
 
 
 def figures_of(config: RunConfig, results: Sequence[StepResult]) -> dict[str, Scalar]:

@@ -12,6 +12,7 @@ import numpy as np
 
 from pipelines.steps.judge import STEP as JUDGE
 from pipelines.steps.render import RenderTimes, read_timed
+from pipelines.steps.train import MESH_STEP
 from pipelines.steps.training import read_summary
 from rtgs.evaluate.judgement import JudgeRecord
 from rtgs.evaluate.networks import check_networks
@@ -20,6 +21,7 @@ from rtgs.mesh.record import MeshRecord
 from rtgs.runs.mixture import PLAIN
 from rtgs.runs.training import has_training, last_training
 from rtgs.workflow import StepContext, StepKind
+from rtgs.workflow.manifest import Manifest
 
 if TYPE_CHECKING:
     from rtgs.evaluate.records import ObjectFacts
@@ -93,7 +95,7 @@ def evaluate(params: EvaluateParams, context: StepContext) -> None:
     times = RenderTimes.read(rendered)
     renders = [read_timed(rendered, times, view.name, view.camera) for view in scene.test]
     settings = params.evaluation
-    known = object_facts(context.inputs["extract_mesh"], scene) if "extract_mesh" in context.inputs else None
+    known = object_facts(context.inputs[MESH_STEP], scene) if MESH_STEP in context.inputs else None
     table = evaluate_views(renders, scene.test, facts, settings, object_facts=known)
     write_json(context.out / TABLE_JSON, table)
     write_csv(context.out / TABLE_CSV, table)
@@ -108,11 +110,11 @@ def evaluate(params: EvaluateParams, context: StepContext) -> None:
 
 
 def _summary(inputs: Mapping[str, Path]) -> TrainSummary | None:
-    """Of the training; where a judge was asked, with what the plain method cost, and the surfels of what is shown.
-    None: the pictures are another program's."""
+    """Of the training with the mesh that it waited for; where a judge was asked, with what the plain method cost, and
+    the surfels of what is shown. None: the pictures are another program's."""
     if not has_training(inputs):
         return None
-    full = read_summary(last_training(inputs))
+    full = _with_mesh(read_summary(last_training(inputs)), inputs)
     if JUDGE.name not in inputs:
         return full
     plain, record = read_summary(inputs[PLAIN]), JudgeRecord.read(inputs[JUDGE.name])
@@ -123,6 +125,15 @@ def _summary(inputs: Mapping[str, Path]) -> TrainSummary | None:
         peak_memory_mb=max(full.peak_memory_mb, plain.peak_memory_mb),
         surfels=(0 if record.all_plain else full.surfels) + (plain.surfels if record.replaced else 0),
     )
+
+
+def _with_mesh(summary: TrainSummary, inputs: Mapping[str, Path]) -> TrainSummary:
+    """The times with those of the transparent object's mesh: the third stage cannot begin before it is made."""
+    made = Manifest.read(inputs[MESH_STEP]) if MESH_STEP in inputs else None
+    if made is None:
+        return summary
+    cpu = made.duration if made.cpu_seconds is None else made.cpu_seconds
+    return replace(summary, seconds=summary.seconds + made.duration, cpu_seconds=summary.cpu_seconds + cpu)
 
 
 def object_facts(folder: Path, scene: Scene) -> ObjectFacts | None:
@@ -162,4 +173,4 @@ def _judged(share: float) -> float | None:
     return None if math.isnan(share) else share
 
 
-STEP = StepKind("evaluate", 8, evaluate)
+STEP = StepKind("evaluate", 9, evaluate)

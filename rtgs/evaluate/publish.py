@@ -39,14 +39,12 @@ class Measured:
 
     Attributes:
         paper_scene: the paper's name for the scene, where it has one.
-        mesh_seconds: of the mesh that the training waited for; they count as training.
         differs: in words, each way in which the run is not what the paper describes.
     """
 
     evaluation: EvaluationTable
     seed: int
     paper_scene: str = ""
-    mesh_seconds: float = 0.0
     differs: tuple[str, ...] = ()
 
 
@@ -211,8 +209,7 @@ def _value(key: str, group: Sequence[Measured]) -> Value | None:
 def _of_run(key: str, run: Measured) -> float | None:
     evaluation = run.evaluation
     if key in ("train_seconds", "peak_memory_mb", "surfels"):
-        value = getattr(evaluation.facts, key)
-        return value + run.mesh_seconds if key == "train_seconds" and value is not None else value
+        return getattr(evaluation.facts, key)
     if key.startswith("object_"):
         return None if evaluation.object is None else getattr(evaluation.object, key.removeprefix("object_"))
     return evaluation.mean(key)

@@ -43,7 +43,7 @@ TRANSMITTANCE = StageSpec(
     on=_transmittance_on,
     on_key="method.transmittance.enabled",
     needs_object=True,
-    version=7,
+    version=8,
 )
 """Straight rays through the transparent object, all sets jointly."""
 

@@ -286,6 +286,11 @@ class TransmittanceSettings:
     init: InitSettings = field(default_factory=_transmittance_init)
     density: DensitySettings = field(default_factory=_reflection_density)
 
+    @property
+    def masks_alone(self) -> bool:
+        """Only masks say which pixels show the object: nothing knows its mesh, as in ``ablation=no_mesh_guide``."""
+        return self.second_bounce == "first_bounce" and self.test_masks == "as_trained"
+
     def __post_init__(self) -> None:
         refuse_bad_numbers(self, "method.transmittance")
         refuse_unknown_words(self, "method.transmittance")

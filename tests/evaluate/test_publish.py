@@ -218,15 +218,6 @@ def test_every_way_in_which_runs_differ_from_the_paper_stands_under_its_figures(
     assert short not in markdown(build_table(TableSpec("t", "T", "stand_in"), runs))  # no figures of the paper there
 
 
-def test_seconds_of_training_have_the_mesh_it_waited_for():
-    table = build_table(
-        STAND_IN, [dataclasses.replace(run("rtgs", "a", 30.0), mesh_seconds=12.0), run("2dgs", "a", 29.0)]
-    )
-    seconds = {method: cell.values["train_seconds"] for (method, _), cell in table.cells.items()}
-    assert {method: value and value.mean for method, value in seconds.items()} == {"rtgs": 72.0, "2dgs": 60.0}
-    assert "training s, mesh included" in markdown(table)
-
-
 def test_cells_are_escaped_for_latex_and_for_spreadsheets():
     spec = TableSpec("t", "A $10^3 ~ {x}_1 & #2 \\write18{rm} 100 %", "own")
     table = build_table(spec, [run("=cmd|'/c calc'!A1", "@sum{a}", 25.0)])

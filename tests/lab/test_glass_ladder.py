@@ -30,6 +30,7 @@ from lab.glass_ladder import (
 )
 from pipelines.planning.graph import build_graph
 from rtgs.config import compose
+from rtgs.methods.plans import propagation_due, reflection_plan
 
 TINY = (
     *("scene.long_side=48", "schedule.total=12", "schedule.checkpoint_every=12", "method.density.max_surfels=800"),
@@ -89,6 +90,22 @@ def test_the_papers_way_has_no_interface_at_any_size(tmp_path: Path, size: str):
         for name in RUNGS
         if name.startswith("paper")
     )
+
+
+@pytest.mark.parametrize("size", ["small", "preset"])
+def test_normal_propagation_has_steps_to_act_in(tmp_path: Path, size: str):
+    arguments = SimpleNamespace(preset="quick", size=size, set=[], root=tmp_path)
+    config = base_config("ball_statue", arguments)  # type: ignore[arg-type]
+    setting = Setting("ball_statue", tmp_path / "split.json", tmp_path / "container.ply", ())
+    words = ["scene=ball_statue", "method=rtgs", "preset=quick", *sized(arguments)]  # type: ignore[arg-type]
+    chosen = compose([*words, *RUNGS["paper_propagation"].words(setting, config)])[0]
+    method = chosen.method.in_scene(glass=True)
+    plan, third = (
+        reflection_plan(method.reflection, chosen.schedule),
+        round(method.transmittance.start * config.schedule.total),
+    )
+    due = [step for step in range(1, third + 1) if propagation_due(plan, method.reflection, step)]
+    assert len(due) >= 2
 
 
 def test_groups_are_rungs_named_once():

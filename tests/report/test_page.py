@@ -139,6 +139,20 @@ def test_page_is_self_contained(tmp_path: Path) -> None:
         assert picture.size == (48, 32)
 
 
+def test_page_shows_flip_of_every_view_and_where_it_is() -> None:
+    data = full_data()
+    rows = tuple(
+        replace(row, values=row.values | {"flip": 0.1 + 0.01 * index, "flip_masked": 0.3 + 0.01 * index})
+        for index, row in enumerate(data.evaluation.rows)
+    )
+    parsed = outline(render_report(replace(data, evaluation=replace(data.evaluation, rows=rows))))
+    text = " ".join(" ".join(parsed.text).split())
+    assert "FLIP in mask" in text
+    assert "difference as it is seen when render and photo alternate" in text
+    for figure in ("0.1000", "0.1100", "0.1200", "0.3000", "0.3100", "0.3200"):
+        assert figure in text
+
+
 def test_page_shows_the_figures_and_the_reasons() -> None:
     text = " ".join(" ".join(outline(render_report(full_data())).text).split())
     assert "21.00 dB" in text  # mean of 20, 21, 22

@@ -20,7 +20,7 @@ from rtgs.mesh.silhouettes import bounding
 from rtgs.methods.parts.base import BaseSet, composited
 from rtgs.methods.parts.gaussian_set import GaussianSet, densified, opacity_reset
 from rtgs.methods.parts.glass_evidence import glass_faces, kept_in_base, left_out, reason_against
-from rtgs.methods.parts.glass_pixels import object_pixels
+from rtgs.methods.parts.glass_pixels import object_pixels, views_without_glass
 from rtgs.methods.parts.glass_sets import drawn_in_box, interface_set, taken_from_base, transmittance_set
 from rtgs.methods.parts.interface_set import InterfaceSet, interface_surfels
 from rtgs.methods.parts.mirror import Mirror, Reflected, stored_surfels
@@ -94,6 +94,7 @@ class Glass(Part):
         self._left_out: float | None = None  # why, where the stage was: of :func:`reason_against`
         self._points = setup.scene.points
         self._views = setup.scene.train
+        self._all_views = (*setup.scene.train, *setup.scene.test)
         self._found: ObjectGuide | None = None  # of the mesh as it was found
         if setup.object_mesh is not None and settings.transmittance.enabled:
             self.guide = self._found = ObjectGuide(setup.object_mesh)
@@ -119,7 +120,8 @@ class Glass(Part):
             return (left_out(self._left_out),)
         asking = self.settings.single_rays if self.settings.transmittance.contents == "rasterized" else ""
         traced = (Decision("contents are traced", f"{asking} needs the hits of single rays"),) if asking else ()
-        return (*traced, *(decision for each in self._learners for decision in each.decisions))
+        bare = views_without_glass(self.settings.transmittance, self._all_views) if self.begun else ()
+        return (*traced, *bare, *(decision for each in self._learners for decision in each.decisions))
 
     def mask(self, view: View) -> Tensor | None:
         """L_spec acts in masks that bound something, unless the stage was left out."""

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
 from torch import Tensor
 
+from rtgs.core.decisions import Decision
 from rtgs.mesh.container import ObjectSurfaces
 from rtgs.mesh.silhouettes import bounding
 from rtgs.methods.parts.part import Frame
@@ -11,10 +16,14 @@ from rtgs.methods.settings import TransmittanceSettings
 from rtgs.methods.shading.mirror import SurfacePixels
 from rtgs.methods.shading.straight import GlassPixels, glass_pixels, widened
 
+if TYPE_CHECKING:
+    from rtgs.scenes.scene import View
+
 
 def shown_inside(settings: TransmittanceSettings, frame: Frame, hit: Tensor, centers: Tensor) -> Tensor:
     """(H, W) bool: pixels that get straight rays. Those of the view's mask in training, of the silhouette or of given
-    masks else; and those that show the object beside their centre.
+    masks else; and those that show the object beside their centre. Where masks alone may say it, a view without one
+    has none of them.
 
     Args:
         settings: of the stage.
@@ -23,6 +32,8 @@ def shown_inside(settings: TransmittanceSettings, frame: Frame, hit: Tensor, cen
         centers: (H, W) bool: those of them whose centre does.
     """
     mask = bounding(frame.mask)
+    if settings.masks_alone:
+        return torch.zeros_like(hit) if mask is None else mask
     source = "given" if frame.training else frame.options.masks or settings.test_masks
     as_trained = frame.training or settings.test_masks == "as_trained"
     if source == "silhouette" or mask is None:  # a view without a mask shows the object all the same
@@ -32,6 +43,15 @@ def shown_inside(settings: TransmittanceSettings, frame: Frame, hit: Tensor, cen
     else:
         inside = mask & hit  # method.md 6.3: where the ray misses the mesh nothing is transmitted
     return widened(inside | (hit & ~centers), settings.rim if settings.interface.count > 0 else 0)
+
+
+def views_without_glass(settings: TransmittanceSettings, views: Sequence[View]) -> tuple[Decision, ...]:
+    """What is said of views that show no glass for want of a mask."""
+    bare = [view.name for view in views if bounding(view.mask) is None] if settings.masks_alone else []
+    if not bare:
+        return ()
+    why = "without a mask only the object's mesh knows where it is (method.transmittance.second_bounce=first_bounce)"
+    return (Decision(f"no glass in {len(bare)} of {len(views)} views, {bare[0]} first", why),)
 
 
 def object_pixels(

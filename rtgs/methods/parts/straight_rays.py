@@ -90,7 +90,7 @@ class StraightRays:
         first, observations = self._first_bounce(frame, rays, pixels, degree)
         assert first.colors is not None
         color, parts = first.colors, {}
-        if self.settings.transmittance.second_bounce != "none" and not self.mesh.flat:
+        if self._goes_on:
             rows, behind = self._behind(rays if onward is None else onward, first, degree)
             shown = (1 - first.alpha)[:, None] if self.settings.transmittance.compositing == "over" else None
             if wall is None:
@@ -103,6 +103,12 @@ class StraightRays:
         full, *lights = (_of_pixels(rays, each) for each in (color, *parts.values()))
         depths = self._depths(rays, first) if self.measured else None
         return Transmission(full, depths, observations, dict(zip(parts, lights, strict=True)))
+
+    @property
+    def _goes_on(self) -> bool:
+        """There is a second bounce. A pane has no back surface, and what begins at the first bounce asks for none."""
+        bounce = self.settings.transmittance.second_bounce
+        return bounce == "first_bounce" or (bounce == "mesh" and not self.mesh.flat)
 
     def _sent(self, passing: Tensor, wall: FarWall) -> Tensor:
         """(R, 3) linear light that the far wall sends on: ``passing`` light, less what it reflects, and mirrored."""

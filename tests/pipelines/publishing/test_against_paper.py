@@ -8,10 +8,8 @@ import pytest
 
 from pipelines.publishing import against_paper
 from pipelines.publishing.against_paper import keys_of, ways_of
-from pipelines.publishing.tables import _mesh_seconds
 from rtgs.config import compose
 from rtgs.core.decisions import Decision
-from rtgs.workflow import StepResult
 
 SCENE = "scene=nu_nerf/ballstatue"
 
@@ -65,15 +63,3 @@ def test_what_training_left_out_is_told(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(against_paper, "final_training", lambda results: None)
     config = compose([SCENE, "method=rtgs_printed", "preset=paper"])[0]
     assert ways_of(config, "rtgs_printed", ()) == ("no perceptual loss: no weights",)
-
-
-def test_the_mesh_that_training_waited_for_counts_and_another_does_not():
-    def result(name: str, seconds: float, *upstream: StepResult) -> StepResult:
-        step = SimpleNamespace(
-            name=name, fingerprint=f"{name}{seconds}", upstream=tuple(each.step for each in upstream)
-        )
-        return SimpleNamespace(step=step, duration=seconds)  # type: ignore[return-value]
-
-    awaited, asked = result("extract_mesh", 7.0), result("extract_mesh", 3.0)
-    assert _mesh_seconds([awaited, result("train_transmittance", 60.0, awaited)]) == 7.0
-    assert _mesh_seconds([result("train_diffuse", 60.0), asked]) == 0

@@ -28,6 +28,7 @@ from rtgs.runs.views import read_render
 from rtgs.scenes.canonical import read_scene
 from rtgs.scenes.scene import Scene
 from rtgs.train.method import Mode
+from rtgs.workflow.manifest import Manifest
 from tests.pipelines.app_cases import QUICK, _in_root, capture, root  # noqa: F401  (fixtures)
 from tests.pipelines.steps.test_transmittance_stage import TINY, write_capture
 
@@ -122,7 +123,9 @@ def test_a_judged_run_says_what_it_shows(glass, capsys, monkeypatch):
         json.loads((folders(run)[name] / "summary.json").read_text())["seconds"]
         for name in ("train_transmittance", PLAIN)
     ]
-    assert table["facts"]["train_seconds"] == pytest.approx(sum(seconds))
+    mesh = Manifest.read(folders(run)["extract_mesh"])
+    assert mesh is not None
+    assert table["facts"]["train_seconds"] == pytest.approx(sum(seconds) + mesh.duration)
 
 
 def test_a_method_that_loses_everywhere_is_not_shown_at_all(capture, root):

@@ -15,10 +15,12 @@ from PIL import Image
 
 from pipelines.cli.main import main
 from pipelines.planning.graph import RunGraph, build_graph
+from pipelines.publishing.results import result_table
 from pipelines.steps.evaluate import TRACKED
 from rtgs.config import compose
 from rtgs.config.locate import conf_dir
 from rtgs.evaluate.boundary import BOUNDARY_FILE
+from rtgs.evaluate.records import read_json as read_evaluation
 from rtgs.mesh.container import read_object_mesh
 from rtgs.methods.model import Model
 from rtgs.runs.training import OBJECT_FOLDER, load_method, stage_params
@@ -279,12 +281,23 @@ def test_table_3_runs_each_shared_step_once_and_nothing_twice(root: Path, glass:
     assert all(row[name] for row in rows for name in ("psnr_masked", "ssim_masked", "object_silhouette_iou"))
     _the_transparent_part_is_tracked(root)
     _artifacts_are_complete(store, third)
+    _seconds_have_the_mesh(root, rows)
     (run,) = (root / "runs").glob("glass_ball-rtgs-smoke-lpips*")  # the others have an ablation in their name
     page = (run / "report.html").read_text()
     assert "Transmission" in page
     assert "surface before the third stage" in page
     table = json.loads((run / "metrics.json").read_text())
     assert table["mean"]["psnr_masked"] is not None
+    with (run / "metrics.csv").open(encoding="utf-8") as stream:
+        listed = {row["view"]: row for row in csv.DictReader(stream)}
+    for name in ("flip", "flip_masked"):
+        assert 0 < table["mean"][name] < 1
+        assert f"{table['mean'][name]:.4f}" in page
+        assert {view: float(row[name]) for view, row in listed.items() if view not in ("mean", "std")} == {
+            row["view"]: row["values"][name] for row in table["views"]
+        }
+        assert float(listed["mean"][name]) == table["mean"][name]
+        assert table["mean"][name] in [run.get(f"eval/{name}") for run in events(root)]
     assert table["mean"]["psnr_masked_given_masks"] is not None
     assert table["object"]["silhouette_iou"] > 0.5
     assert 0 <= table["object"]["no_hit"] < 0.5, "the guide's fallbacks are counted"
@@ -292,16 +305,46 @@ def test_table_3_runs_each_shared_step_once_and_nothing_twice(root: Path, glass:
     assert "meet one surface only" in page
 
 
+def events(folder: Path) -> list[dict[str, float]]:
+    """The figures of every event that was tracked."""
+    lines = (line for file in folder.rglob("events.jsonl") for line in file.read_text().splitlines())
+    return [json.loads(line).get("values", {}) for line in lines]
+
+
 def _the_transparent_part_is_tracked(folder: Path) -> None:
     """What the tables hold of it, and what is measured at the stage's boundaries."""
-    lines = (line for file in folder.rglob("events.jsonl") for line in file.read_text().splitlines())
-    found = {name for line in lines for name in json.loads(line).get("values", {})}
+    found = {name for values in events(folder) for name in values}
     wanted = {f"eval/{name}" for name in ("psnr_masked", "ssim_masked", "psnr_masked_given_masks")}
+    wanted |= {"eval/flip", "eval/flip_masked"}
     wanted |= {"object/silhouette_iou", "object/one_hit", "object/no_hit", "mesh/silhouette_iou"}
     wanted |= {f"boundary/{when}/silhouette_iou" for when in ("before", "after")}
     assert wanted <= found
     of_truth = {f"psnr_{layer}{scaled}" for layer in ("reflection", "transmission") for scaled in ("", "_scaled")}
     assert {*of_truth, "depth_share_masked", "normal_degrees_masked"} <= {*TRACKED}
+
+
+def _seconds_have_the_mesh(folder: Path, rows: list[dict[str, str]]) -> None:
+    """Wherever a training time is shown: of training and of the mesh that its third stage waited for."""
+    told = [value for run in events(folder) for name, value in run.items() if name == "cost/train_seconds"]
+    shown = {}
+    for run in sorted(path.parent for path in (folder / "runs").glob("*/run.json")):
+        steps = json.loads((run / "run.json").read_text())["steps"]
+        mesh, third = (
+            folder / "store" / name / (key := steps[name])[:2] / key for name in ("extract_mesh", "train_transmittance")
+        )
+        manifest, summary = Manifest.read(mesh), json.loads((third / "summary.json").read_text())
+        assert manifest is not None
+        assert manifest.cpu_seconds is not None
+        facts = json.loads((run / "metrics.json").read_text())["facts"]
+        assert facts["train_seconds"] == pytest.approx(summary["seconds"] + manifest.duration)
+        assert facts["train_cpu_seconds"] == pytest.approx(summary["cpu_seconds"] + manifest.cpu_seconds)
+        with (run / "metrics.csv").open(encoding="utf-8") as stream:
+            assert {float(row["train_seconds"]) for row in csv.DictReader(stream)} == {facts["train_seconds"]}
+        assert facts["train_seconds"] in told
+        assert "steps, mesh included" in (run / "report.html").read_text()
+        assert f"{facts['train_seconds']:.1f} s" in result_table([read_evaluation(run / "metrics.json")])
+        shown[facts["method"]] = facts["train_seconds"]
+    assert {row["method"]: float(row["train_seconds"]) for row in rows} == pytest.approx(shown)
 
 
 def _artifacts_are_complete(store: Path, third: list[Path]) -> None:
