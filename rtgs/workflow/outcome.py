@@ -44,8 +44,8 @@ class StepOutcome:
 
 @dataclass(frozen=True)
 class SweepOutcomes:
-    """All steps of a sweep by fingerprint, what its merged plan had said of them, and the ids of the tracker's runs that
-    were shown meanwhile, by fingerprint of their last step."""
+    """All steps of a sweep by fingerprint, what its merged plan had said of them, and ids of the runs that the tracker
+    showed meanwhile, by fingerprint of their last step."""
 
     outcomes: Mapping[str, StepOutcome]
     planned: Mapping[str, PlannedStep] = field(default_factory=dict)
