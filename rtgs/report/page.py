@@ -225,7 +225,7 @@ def _charts(curves: Sequence[Curve]) -> list[str]:
     return [
         curve_svg([_renamed(curve, "train/") for curve in losses], label="Loss terms", log=True),
         curve_svg([_renamed(curve, "", "/psnr") for curve in psnr], label="PSNR, dB"),
-        curve_svg([_renamed(curve, "surfels/") for curve in counts], label="Surfels"),
+        curve_svg([_renamed(curve, "surfels/") for curve in counts], label="Gaussians"),
     ]
 
 
