@@ -55,7 +55,7 @@ def test_every_experiment_is_listed_with_its_page_and_best_run(tmp_path):
     (steps,) = [line for line in lines if "rtgs/steps: 1 executed steps" in line]
     assert "viewStateShareKey" not in steps
     assert lines[-1] == steps  # what is compared comes first
-    assert any(re.search(r"its pictures: .*/runs/\w+/artifacts/report\.html\?workflowType=machine_learning$", line) for line in lines)
+    assert any(re.search(r"its pictures: .*/runs/\w+/artifacts/report\.html\?workflow", line) for line in lines)
     assert any(re.search(rf"newest sweep: .*/artifacts/tables/{FIGURES}.json\?workflow", line) for line in lines)
     assert all(word in GUIDE for word in ("Model metrics", "tables/eval.json", "report.html", f"{FIGURES}.json"))
 
