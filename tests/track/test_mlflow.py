@@ -239,4 +239,5 @@ def test_an_announced_run_is_seen_running_and_gone_on_with(tracking):
     assert (mine.info.run_name, mine.info.status, left.info.status) == ("renamed", "FINISHED", "FAILED")
     assert mine.data.metrics == {"eval/psnr": 20.0}
     assert mine.data.tags["mlflow.parentRunId"] == "p"
+    assert mine.info.end_time is not None
     assert 1000 <= mine.info.end_time - mine.info.start_time < 2400  # its own work, not what it waited for

@@ -166,7 +166,9 @@ def test_the_runs_of_a_sweep_are_seen_while_workers_are_at_it(capture, tmp_path,
 
 def _runs(root: Path) -> list:
     client = MlflowTracking(root).client
-    return list(client.search_runs([client.get_experiment_by_name("rtgs/runs").experiment_id]))
+    experiment = client.get_experiment_by_name("rtgs/runs")
+    assert experiment is not None
+    return list(client.search_runs([experiment.experiment_id]))
 
 
 def test_the_plan_of_a_sweep_names_the_jobs_that_could_not_start(capture, capsys):
