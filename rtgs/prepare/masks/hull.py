@@ -117,7 +117,9 @@ class Hull:
         cells = np.rint((self.points - self.points.min(axis=0)) / self.voxel).astype(int)
         grid = np.zeros(cells.max(axis=0) + 1, dtype=bool)
         grid[tuple(cells.T)] = True
-        parts = ndimage.label(grid, np.ones((3, 3, 3)))[0][tuple(cells.T)]
+        labels = np.zeros(grid.shape, dtype=np.int32)
+        ndimage.label(grid, np.ones((3, 3, 3)), output=labels)
+        parts = labels[tuple(cells.T)]
         return Hull(self.points[parts == np.bincount(parts).argmax()], self.voxel)
 
     def pixels(self, mask: SmallMask, depth: float) -> float:
