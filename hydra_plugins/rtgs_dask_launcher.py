@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -57,20 +58,23 @@ class RtgsDaskLauncher(Launcher):
         configure_log(self._config.hydra.hydra_logging, self._config.hydra.verbose)
         Path(str(self._config.hydra.sweep.dir)).mkdir(parents=True, exist_ok=True)
         composed = [self._compose(number, words, initial_job_idx) for number, words in enumerate(job_overrides)]
-        outcomes = run_merged([job for config in composed if (job := _job(config)) is not None], self.settings)
-        task, returns = self._task.after(outcomes), []
-        for words, config in zip(job_overrides, composed):
-            log.info("#%s: %s", config.hydra.job.num, " ".join(filter_overrides(words)))
-            returns.append(
-                run_job(
-                    hydra_context=self._context,
-                    task_function=task,
-                    config=config,
-                    job_dir_key="hydra.sweep.dir",
-                    job_subdir_key="hydra.sweep.subdir",
+        task, returns = self._task, []
+        jobs = [job for config in composed if (job := _job(config)) is not None]
+        with ExitStack() as shown:
+            outcomes = run_merged(jobs, self.settings, lambda *planned: shown.enter_context(task.shown(*planned)))
+            after = task.after(outcomes)
+            for words, config in zip(job_overrides, composed):
+                log.info("#%s: %s", config.hydra.job.num, " ".join(filter_overrides(words)))
+                returns.append(
+                    run_job(
+                        hydra_context=self._context,
+                        task_function=after,
+                        config=config,
+                        job_dir_key="hydra.sweep.dir",
+                        job_subdir_key="hydra.sweep.subdir",
+                    )
                 )
-            )
-            configure_log(self._config.hydra.hydra_logging, self._config.hydra.verbose)
+                configure_log(self._config.hydra.hydra_logging, self._config.hydra.verbose)
         return returns
 
     def _compose(self, number: int, words: Sequence[str], first: int) -> DictConfig:

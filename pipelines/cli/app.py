@@ -132,11 +132,11 @@ def _recorded(run: _Run) -> bool:
 def _tracked(run: _Run, parent: str) -> RunOutcome:
     from pipelines.publishing.results import note_tracked, run_info, track_end, track_start, write_run_folder
 
-    config, choices, plan = run.config, run.choices, run.plan
+    config, choices, plan, outcomes = run.config, run.choices, run.plan, run.membership.outcomes
     info = run_info(config, choices, plan, parent)
-    before = run.membership.outcomes.seconds(plan)
-    with run.tracking.run(replace(info, seconds_before=before)) as tracker:
-        track_start(tracker, config, choices, run.membership.outcomes.as_planned(plan))
+    before, announced = outcomes.seconds(plan), outcomes.announced.get(info.fingerprint, "")
+    with run.tracking.run(replace(info, seconds_before=before, announced=announced)) as tracker:
+        track_start(tracker, config, choices, outcomes.as_planned(plan))
         executor = InlineExecutor(run.store, run.tracking, run.remote, onlooker=run.onlooker)
         results = executor.execute(plan)
         folder = write_run_folder(config, choices, run.command, results)

@@ -21,6 +21,7 @@ _OF_COMMANDS = {
     "export": ("format=", "steps=", "splats=", "out=", "threads=", "root="),
     "cache": ("ls", "gc", "verify", "push", "pull", "--partial", "--older-than", "--remote", "--root"),
     "check": ("scene=", "data=ref_real", "data=nu_nerf"),
+    "outline": ("scene=",),
     "report": ("--open", "--root"),
     "weights": ("status",),
     "dashboard": ("--root", "--port"),
@@ -139,8 +140,8 @@ def complete(words: Sequence[str], commands: Sequence[str], root: Path) -> list[
         return _beginning(unfinished, [*capture_names(), "to="])
     found = _beginning(unfinished, _OF_COMMANDS.get(command, ()))
     of_run = command in _OF_RUNS or (command == "cache" and words[1] in ("push", "pull") and len(words) > 2)
-    if of_run or (command == "check" and unfinished.startswith("scene")):
-        found = _words_of_run(unfinished) + (found if command == "check" else [])
+    if of_run or (command in ("check", "outline") and unfinished.startswith("scene")):
+        found = _words_of_run(unfinished) + (found if command not in _OF_RUNS else [])
     if command == "explain" and unfinished and "=" not in unfinished:
         found = [each.removesuffix("=") for each in found]
     return list(dict.fromkeys(found)) or [FILES]

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from pipelines.cli.sweep_summary import FIGURES
 from pipelines.cli.termination import serve_until_interrupted
+from pipelines.steps.report import PAGE as REPORT
 from rtgs.core.errors import RtgsError
 from rtgs.track.mlflow import PARENT_TAG, MlflowTracking
 from rtgs.track.mlflow_view import SORTED_BY, artifact_link, view_link
@@ -46,7 +47,8 @@ def serve(root: Path, port: int) -> int:
 def overview(tracking: MlflowTracking, address: str) -> list[str]:
     """Of each experiment: how many sweeps and runs, its page, the best run and its pictures, the newest table."""
     lines = []
-    for experiment in tracking.client.search_experiments():
+    experiments = tracking.client.search_experiments()
+    for experiment in sorted(experiments, key=lambda one: one.name == STEPS_EXPERIMENT):  # what is compared first
         runs = list(tracking.client.search_runs([experiment.experiment_id], max_results=_PAGE))
         if not runs:
             continue
@@ -65,7 +67,7 @@ def overview(tracking: MlflowTracking, address: str) -> list[str]:
             text += f", best {best.info.run_name} with {best.data.metrics[SORTED_BY]:.2f} dB"
         lines.append(f"{text}  {view_link(address, number)}")
         if best is not None:
-            lines.append(f"    its pictures: {artifact_link(address, number, best.info.run_id, 'images')}")
+            lines.append(f"    its pictures: {artifact_link(address, number, best.info.run_id, REPORT)}")
         newest = next((run for run in runs if SWEEP_TAG in run.data.tags), None)
         if newest is not None:
             shown = artifact_link(address, number, newest.info.run_id, f"tables/{FIGURES}.json")

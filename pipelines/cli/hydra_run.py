@@ -12,8 +12,8 @@ import importlib
 import io
 import logging
 import re
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, redirect_stdout
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,9 @@ from hydra.types import HydraContext, RunMode, TaskFunction
 from omegaconf import DictConfig, OmegaConf
 
 from pipelines.cli.app import NO_SWEEP, Membership, RunOutcome, execute, short
+from pipelines.cli.live_runs import live_runs
 from pipelines.cli.sweep_summary import finished_elsewhere, same_folders, side_by_side, write_tables
+from pipelines.planning.plan import MergedJobs
 from pipelines.planning.sweep import Sweep
 from rtgs.config.compose import choices_from
 from rtgs.config.convert import hide_credentials, to_run_config
@@ -38,7 +40,7 @@ from rtgs.config.schema import register_schema
 from rtgs.config.words import friendly_overrides
 from rtgs.core.credentials import redact
 from rtgs.core.errors import RtgsError
-from rtgs.workflow import SweepOutcomes
+from rtgs.workflow import Plan, SweepOutcomes
 
 log = logging.getLogger("rtgs")
 TOPLEVEL_PLUGINS = "hydra_plugins"  # where Hydra wants them
@@ -69,6 +71,11 @@ class HydraApp:
     def after(self, outcomes: SweepOutcomes) -> TaskFunction:
         """:meth:`pipelines.planning.sweep.SweepTask.after`."""
         return lambda composed: self._job(composed, outcomes)
+
+    def shown(self, merged: MergedJobs, plan: Plan) -> AbstractContextManager[Mapping[str, str]]:
+        """:meth:`pipelines.planning.sweep.SweepTask.shown`."""
+        assert self.sweep is not None
+        return live_runs(merged, plan, self.sweep)
 
     def _job(self, composed: DictConfig, outcomes: SweepOutcomes) -> None:
         hydra = HydraConfig.get()

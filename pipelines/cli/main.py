@@ -1,4 +1,4 @@
-"""The ``rtgs`` command: run, plan, figures, cache, get, check, show, view, export, weights, report, dashboard."""
+"""The ``rtgs`` command: run, plan, check, outline, show, view, export, report, dashboard, and what they need."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ USAGE = f"""rtgs {VERSION}: Gaussian models of scenes with glass and mirrors, on
   rtgs figures [NAME] [key=value]         the paper's pictures as panels, from runs that are in the store
   rtgs get [NAME] [to=FOLDER]             real captures by name: download, compare digests, go on where it stopped
   rtgs check FOLDER | scene=NAME | data=  what is wrong with a capture, before any training
+  rtgs outline FOLDER | VIDEO             poses, and a page on which you outline the glass in a few photos
   rtgs report [RUN]                       where the report of the latest (or the named) run is
   rtgs show [RUN] [path=] [layer=]        films and pictures of a run from anywhere, layer by layer
   rtgs show FILE.ply [--scene NAME]       pictures of any Gaussian splat; with a scene, measured on its test views
@@ -228,6 +229,13 @@ def check(words: list[str]) -> int:
     return 1 if errors else 0
 
 
+def outline(words: list[str]) -> int:
+    """``rtgs outline``: a page on which the glass is outlined."""
+    from pipelines.cli.outline import outline as command
+
+    return command(words)
+
+
 def weights(words: list[str]) -> int:
     """``rtgs weights``: pretrained files by name."""
     parser = argparse.ArgumentParser("rtgs weights", description="Pretrained files; nothing is downloaded.")
@@ -350,6 +358,7 @@ COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "cache": cache,
     "get": get,
     "check": check,
+    "outline": outline,
     "show": show,
     "view": view,
     "export": export,

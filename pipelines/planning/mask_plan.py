@@ -66,7 +66,7 @@ def _automatic(config: RunConfig, inspection: Inspection) -> MaskPlan:
     try:
         find_networks(config.masks)
     except MissingWeights as error:
-        hint = f"; `rtgs weights status` says where to get it, {marks.name} beside the photos does without"
+        hint = f"; `rtgs weights status` says where to get it; without: {marks.name} beside the photos (`rtgs outline`)"
         return MaskPlan("", f"{error}".split("; searched")[0] + hint)
     return MaskPlan("grounded_sam2", "")
 

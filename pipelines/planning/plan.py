@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from pipelines.planning.graph import build_graph
+from pipelines.planning.graph import RunGraph, build_graph
 from pipelines.planning.inspection import Inspections
 from rtgs.config.opened import friendly_words, with_configs
 from rtgs.config.schema import Choices, RunConfig
@@ -37,11 +37,13 @@ class MergedJobs:
     skipped: Mapping[Decision, tuple[str, ...]]  # titles of jobs
     unread: Mapping[Decision, tuple[str, ...]]  # titles of jobs
     problems: tuple[tuple[str, str], ...]  # title, message
+    graphs: tuple[tuple[Job, RunGraph], ...]  # of the jobs that have one
 
 
 def merge_jobs(jobs: Sequence[Job]) -> MergedJobs:
     """Build the graph of every job; captures that several of them use are read once."""
     targets: list[Step] = []
+    graphs: list[tuple[Job, RunGraph]] = []
     needed_by: dict[str, tuple[str, ...]] = {}
     skipped: dict[Decision, tuple[str, ...]] = {}
     unread: dict[Decision, tuple[str, ...]] = {}
@@ -54,13 +56,14 @@ def merge_jobs(jobs: Sequence[Job]) -> MergedJobs:
             problems.append((job.title, str(error)))
             continue
         targets += graph.targets
+        graphs.append((job, graph))
         for step in topological(graph.targets):
             needed_by[step.fingerprint] = (*needed_by.get(step.fingerprint, ()), job.title)
         for step in graph.skipped:
             skipped[step] = (*skipped.get(step, ()), job.title)
         for decision in (*graph.unread, *graph.moved):
             unread[decision] = (*unread.get(decision, ()), job.title)
-    return MergedJobs(tuple(targets), needed_by, skipped, unread, tuple(problems))
+    return MergedJobs(tuple(targets), needed_by, skipped, unread, tuple(problems), tuple(graphs))
 
 
 def describe(plan: Plan) -> str:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -13,16 +14,17 @@ from hydra.types import TaskFunction
 from omegaconf import DictConfig
 
 from pipelines.planning.graph import KINDS
-from pipelines.planning.plan import Job, describe, merge_jobs, remote_store
+from pipelines.planning.plan import Job, MergedJobs, describe, merge_jobs, remote_store
 from rtgs.config.schema import RunConfig
 from rtgs.core.credentials import redact
 from rtgs.core.errors import RtgsError
 from rtgs.track import RunInfo
 from rtgs.track.source import git_tags
-from rtgs.workflow import RemoteStore, Step, Store, SweepOutcomes, make_plan, topological
+from rtgs.workflow import Plan, RemoteStore, Step, Store, SweepOutcomes, make_plan, topological
 from rtgs.workflow.engine import DaskExecutor, EngineSettings, WorkerJob, open_client
 
 log = logging.getLogger("rtgs")
+Shown = Callable[[MergedJobs, Plan], Mapping[str, str]]
 _STARTED = ".started"  # in a sweep's folder: as old as the sweep
 _HERE = ("BasicLauncher", "RtgsDaskLauncher")  # run jobs in the process that starts the sweep
 
@@ -88,9 +90,16 @@ class SweepTask(Protocol):
         that failed."""
         ...
 
+    def shown(self, merged: MergedJobs, plan: Plan) -> AbstractContextManager[Mapping[str, str]]:
+        """The jobs in the tracker, as running, until the context is left: ids of their runs by fingerprint."""
+        ...
 
-def run_merged(jobs: Sequence[Job], settings: EngineSettings) -> SweepOutcomes:
+
+def run_merged(jobs: Sequence[Job], settings: EngineSettings, shown: Shown) -> SweepOutcomes:
     """Bring the steps of all jobs into the store, each once; a job whose graph cannot be built is left to fail alone.
+
+    Args:
+        shown: called before workers begin: shows the jobs in the tracker.
 
     Raises:
         RtgsError: the cluster does not start, what it made is not to be found here, or the jobs disagree about where
@@ -108,10 +117,12 @@ def run_merged(jobs: Sequence[Job], settings: EngineSettings) -> SweepOutcomes:
     if plan.complete:
         return SweepOutcomes({})
     settings.needs.check(kind.name for kind in KINDS)
+    announced = shown(merged, plan)
     with open_client(settings) as client:
         outcomes = DaskExecutor(client, _worker_job(config, settings), settings.room()).attempt(plan)
     check_arrived(merged.targets, outcomes, store, remote_store(config))
-    return replace(outcomes, planned={planned.step.fingerprint: planned for planned in plan})
+    known = {planned.step.fingerprint: planned for planned in plan}
+    return replace(outcomes, planned=known, announced=announced)
 
 
 def check_arrived(

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from rtgs.export.page import GlassScene
     from rtgs.runs.shown import ShownRun
 
+BLURRED = "reflections are in their colours: sharp ones are blurred"
 _OUTSIDE = 0.9  # of the object's radius: what is nearer than this is no surrounding of it
 
 
@@ -35,6 +36,7 @@ def write_run_page(run: ShownRun, found: ExportedRun, path: Path) -> None:
         run.scene.extent,
         background=run.method.settings.render.background,
         glass=glass,
+        note=BLURRED if glass is None and found.record.psnr is not None else "",
     )
 
 

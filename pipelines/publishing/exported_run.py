@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 FOLDER = "exports"
 DIRECT = ("base", "transmittance")  # sets that stand where the eye sees them, straight through glass
 _TELL_EVERY = 20  # pictures
+_MIRRORS = 0.3  # k_s of pixels that mirror
 _AGAIN = "delete it, and the same command makes it again"
 
 
@@ -48,6 +49,7 @@ class BakeRecord:
         psnr: dB against the layered model on held-out cameras; None: nothing was fitted.
         layered_photos: dB of the layered model against the photos of the test views; None: there are none.
         baked_photos: dB of the one set against the same.
+        mirrors: dB against the layered model in the pixels that mirror; None: no pixel does, or nothing was fitted.
         version: of the fit (:data:`rtgs.export.bake.BAKE_VERSION`).
         clear: all pictures are as if the walls of glass were not there: a program that draws them adds them.
     """
@@ -62,6 +64,7 @@ class BakeRecord:
     baked_photos: float | None = None
     clear: bool = False
     version: int = 0
+    mirrors: float | None = None
 
     def fits(self, wanted: BakeRecord) -> bool:
         """Whether it was made of the same model in the same way."""
@@ -73,6 +76,8 @@ class BakeRecord:
             return "the model is one set of Gaussians: nothing is lost"
         what = "layered model without its glass" if self.clear else "layered model"
         text = f"baked: {self.psnr:.2f} dB against the {what} on held-out cameras"
+        if self.mirrors is not None:
+            text += f", {self.mirrors:.2f} dB where it mirrors (sharp reflections blur: colours hold degree 3 at most)"
         if self.layered_photos is None or self.baked_photos is None:
             return text
         lost = self.layered_photos - self.baked_photos
@@ -171,7 +176,8 @@ def export_run(run: ShownRun, settings: BakeSettings, out: Path, *, clear: bool 
     steps = 0 if is_one_set(run) else settings.steps
     wanted = BakeRecord(_trained(run), steps, settings.most or 0, clear=clear, version=BAKE_VERSION)
     cameras = choose_cameras(run.scene)
-    layered = tuple(_image(run, camera, clear) for camera in cameras.held)
+    held = [_seen(run, camera, clear) for camera in cameras.held]
+    layered = tuple(image for image, _ in held)
     record = read_record(BakeRecord, json, _AGAIN) if json.is_file() and ply.is_file() else None
     if record is None or not record.fits(wanted) or record.sha256 != sha256_of(ply):
         out.mkdir(parents=True, exist_ok=True)
@@ -181,6 +187,7 @@ def export_run(run: ShownRun, settings: BakeSettings, out: Path, *, clear: bool 
             record = wanted
         else:
             splats, record = _bake(run, settings, cameras, layered, wanted)
+            record = replace(record, mirrors=_psnr_of_mirrors(run, splats, cameras.held, held))
             write_ply(ply, splats)
         record = replace(record, sha256=sha256_of(ply))
         write_json(json, asdict(record))
@@ -193,12 +200,32 @@ def _read(ply: Path) -> Surfels | Ellipsoids:
     return read_gaussians(ply, channels=())
 
 
-def _image(run: ShownRun, camera: Camera, clear: bool) -> Tensor:
+def _seen(run: ShownRun, camera: Camera, clear: bool) -> tuple[Tensor, Tensor | None]:
+    """(3, H, W) of the layered model, and (H, W) where it mirrors; None: it has no mirrors, or they are not drawn."""
     from rtgs.export.glass import without_glass
 
     maps = run.maps(camera)
     image = without_glass(run.method, camera, maps) if clear else maps["image"]
-    return image.clamp(0, 1).contiguous()
+    mirrors = None if clear or "specular" not in maps else maps["specular"] > _MIRRORS
+    return image.clamp(0, 1).contiguous(), mirrors
+
+
+def _psnr_of_mirrors(
+    run: ShownRun, splats: Gaussians, cameras: Sequence[Camera], seen: Sequence[tuple[Tensor, Tensor | None]]
+) -> float | None:
+    import torch
+
+    from rtgs.train.held_out import psnr_of
+
+    pairs = [
+        (shown(run, splats, camera).clamp(0, 1)[:, mirrors], image[:, mirrors])
+        for camera, (image, mirrors) in zip(cameras, seen)
+        if mirrors is not None
+    ]
+    if not sum(image.numel() for _, image in pairs):
+        return None
+    mine, layered = (torch.cat([pair[k] for pair in pairs], 1) for k in (0, 1))
+    return psnr_of(mine, layered)
 
 
 def has_glass(run: ShownRun) -> bool:
@@ -225,7 +252,7 @@ def _bake(
     begin = joined([part.shown() for part in run.method.sets if part.name in DIRECT])
     fitted = []
     for index, camera in enumerate(cameras.fitted):
-        fitted.append((camera, _image(run, camera, wanted.clear)))
+        fitted.append((camera, _seen(run, camera, wanted.clear)[0]))
         if (index + 1) % _TELL_EVERY == 0 or index + 1 == len(cameras.fitted):
             print(f"  {index + 1} of {len(cameras.fitted)} pictures of the layered model", flush=True)
     held = list(zip(cameras.held, layered))

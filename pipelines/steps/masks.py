@@ -62,4 +62,4 @@ def masks(params: MaskParams, context: StepContext) -> None:
     context.tracker.metrics({"masks/made": float(report.masks), "masks/flagged": float(len(report.flagged))})
 
 
-STEP = StepKind("masks", 2, masks)
+STEP = StepKind("masks", 3, masks)

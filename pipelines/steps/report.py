@@ -229,4 +229,4 @@ def _steps(context: StepContext) -> tuple[StepLine, ...]:
     return tuple(lines)
 
 
-STEP = StepKind("report", 8, report)
+STEP = StepKind("report", 9, report)

@@ -131,3 +131,12 @@ class Camera:
         return replace(
             self, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy, width=width, height=height
         )
+
+
+def mean_up(rotations: Tensor) -> Tensor:
+    """(3,) the way up that cameras (N, 3, 3), world to camera with y down, have in common; not unit.
+
+    Half of a capture upside down: no way prevails, and the first camera's is taken.
+    """
+    up = -rotations[:, 1].mean(0)
+    return up if float(up.norm()) > 1e-3 else -rotations[0, 1]

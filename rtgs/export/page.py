@@ -63,6 +63,7 @@ def write_page(
     *,
     background: Sequence[float] = (0.0, 0.0, 0.0),
     glass: GlassScene | None = None,
+    note: str = "",
 ) -> None:
     """Write the page; an existing file is replaced in one step.
 
@@ -86,6 +87,8 @@ def write_page(
         Colour where nothing is, from 0 to 1.
     glass : GlassScene, optional
         What is drawn over them.
+    note : str, optional
+        What the page says beside the number of Gaussians.
     """
     turn = np.eye(4)
     turn[:3, :3] = frame
@@ -118,7 +121,7 @@ def write_page(
     page = (WEB / "page.html").read_text(encoding="utf-8")
     text = page.format(
         title=html.escape(title),
-        note=f"{len(splats):,} Gaussians",
+        note=html.escape(f"{len(splats):,} Gaussians{f'; {note}' if note else ''}"),
         data="\n".join(blocks),
         script=(WEB / "page.js").read_text(encoding="utf-8"),
         licences=(WEB / "LICENSES.txt").read_text(encoding="utf-8").replace("--", "- -"),

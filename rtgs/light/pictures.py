@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from rtgs.core.cameras import mean_up
 from rtgs.core.errors import RtgsError
 from rtgs.light.cubemap import DirectionalLight
 from rtgs.optics.light import decoded
@@ -109,6 +110,5 @@ def save_environment(folder: Path, light: DirectionalLight, frame: np.ndarray, s
 
 def mean_frame(rotations: Tensor) -> np.ndarray:
     """:func:`upright` of cameras (N, 3, 3), world to camera with x right and y down: mean up, where the first looks."""
-    rows = rotations.double().numpy()
-    up = -rows[:, 1].mean(0)
-    return upright(up if np.linalg.norm(up) > 1e-3 else -rows[0, 1], rows[0, 2])
+    rows = rotations.double()
+    return upright(mean_up(rows).numpy(), rows[0, 2].numpy())

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from rtgs.core.cameras import Camera
+from rtgs.core.cameras import Camera, mean_up
 from rtgs.gaussians.primitives import Gaussians
 
 BULK = (0.02, 0.98)  # quantiles of each coordinate, weighted by opacity, between which the bulk of a model lies
@@ -77,9 +77,7 @@ def orbit_of_cameras(cameras: Sequence[Camera]) -> Orbit:
         raise ValueError(f"{len(cameras)} cameras; an orbit needs at least 2")
     centers = torch.stack([camera.center for camera in cameras])
     axes = torch.stack([camera.rotation[2] for camera in cameras])
-    ups = -torch.stack([camera.rotation[1] for camera in cameras])
-    mean_up = ups.mean(dim=0)
-    up = _unit(mean_up if float(mean_up.norm()) > 1e-3 else ups[0])  # half of a capture upside down: none prevails
+    up = _unit(mean_up(torch.stack([camera.rotation for camera in cameras])))
     across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]
     # The point nearest to all optical axes; a little weight on the mean centre keeps parallel axes solvable.
     damping = 1e-3 * torch.eye(3, dtype=torch.float64)

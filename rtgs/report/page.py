@@ -225,7 +225,7 @@ def _charts(curves: Sequence[Curve]) -> list[str]:
     return [
         curve_svg([_renamed(curve, "train/") for curve in losses], label="Loss terms", log=True),
         curve_svg([_renamed(curve, "", "/psnr") for curve in psnr], label="PSNR, dB"),
-        curve_svg([_renamed(curve, "surfels/") for curve in counts], label="Surfels"),
+        curve_svg([_renamed(curve, "surfels/") for curve in counts], label="Gaussians"),
     ]
 
 
@@ -352,4 +352,6 @@ def _duration(seconds: float | None) -> str:
         return f"{seconds:.1f} s"
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
-    return f"{hours} h {minutes:02d} min" if hours else f"{minutes} min {rest:02d} s"
+    if hours or minutes >= 10:  # seconds would break the line of a tile, and tell nothing
+        return f"{hours} h {minutes:02d} min" if hours else f"{minutes} min"
+    return f"{minutes} min {rest:02d} s"

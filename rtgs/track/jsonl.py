@@ -104,6 +104,11 @@ class JsonlTracking:
             tracker.close()
 
     @contextmanager
+    def announce(self, infos: Sequence[RunInfo]) -> Iterator[Mapping[str, Tracker]]:
+        """Nothing: nobody watches files."""
+        yield {}
+
+    @contextmanager
     def sweep(self, info: RunInfo) -> Iterator[Tracker]:
         """The folder ``<root>/<experiment>/sweep_<fingerprint>``, made or continued."""
         folder = self.root / safe_name(info.experiment) / f"sweep_{safe_name(info.fingerprint)}"

@@ -12,8 +12,8 @@ import secrets
 import sqlite3
 import time
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -156,15 +156,9 @@ class MlflowTracking:
     @contextmanager
     def run(self, info: RunInfo) -> Iterator[Tracker]:
         """A new run, held by a kernel lock for as long as this process lives."""
-        experiment = self._experiment(info.experiment, ranked=STEP_TAG not in info.tags)
-        self._reap([experiment])
-        token = secrets.token_hex(16)
-        tags = {FINGERPRINT_TAG: info.fingerprint, LOCK_TAG: token, **info.tags}
-        if info.parent:
-            tags[PARENT_TAG] = info.parent
+        opened = self._go_on(info) if self._runs(info.announced) else self._begin(info)
         status = "FAILED"
-        with self._alive(token):  # before the run exists: there is no moment at which it has no lock
-            run_id = self._create(experiment, info, tags)
+        with opened as (run_id, ends):
             tracker = MlflowTracker(self.client, run_id)
             try:
                 yield tracker
@@ -176,7 +170,50 @@ class MlflowTracking:
                 try:
                     tracker.flush()
                 finally:
-                    self.client.set_terminated(run_id, status)
+                    self.client.set_terminated(run_id, status, ends())
+
+    @contextmanager
+    def _begin(self, info: RunInfo) -> Iterator[tuple[str, Callable[[], int | None]]]:
+        """A new run, and when it ends: now."""
+        experiment = self._experiment(info.experiment, ranked=STEP_TAG not in info.tags)
+        self._reap([experiment])
+        token = secrets.token_hex(16)
+        tags = {FINGERPRINT_TAG: info.fingerprint, LOCK_TAG: token, **info.tags}
+        if info.parent:
+            tags[PARENT_TAG] = info.parent
+        with self._alive(token):  # before the run exists: there is no moment at which it has no lock
+            yield self._create(experiment, info, tags), lambda: None
+
+    @contextmanager
+    def _go_on(self, info: RunInfo) -> Iterator[tuple[str, Callable[[], int | None]]]:
+        """The announced run, whose lock is held there. It has also waited for the others' work: its end is put where
+        its duration is that of its own."""
+        began = time.time()
+        self.client.update_run(info.announced, name=info.name)
+        start = self.client.get_run(info.announced).info.start_time
+        yield info.announced, lambda: start + int(1000 * (info.seconds_before + time.time() - began))
+
+    def _runs(self, run_id: str) -> bool:
+        return bool(run_id) and self.client.get_run(run_id).info.status == "RUNNING"
+
+    @contextmanager
+    def announce(self, infos: Sequence[RunInfo]) -> Iterator[Mapping[str, Tracker]]:
+        """Runs with state RUNNING, each with its lock."""
+        shown: dict[str, Tracker] = {}
+        status = "FAILED"
+        with ExitStack() as locks:
+            try:
+                for info in infos:
+                    run_id, _ = locks.enter_context(self._begin(info))
+                    shown[info.fingerprint] = MlflowTracker(self.client, run_id)
+                yield shown
+            except KeyboardInterrupt:
+                status = "KILLED"
+                raise
+            finally:
+                for tracker in shown.values():
+                    if self._runs(tracker.id):
+                        self.client.set_terminated(tracker.id, status)
 
     @contextmanager
     def sweep(self, info: RunInfo) -> Iterator[Tracker]:

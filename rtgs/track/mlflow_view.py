@@ -19,6 +19,7 @@ KIND = "custom_model_development"
 SORTED_BY = "eval/psnr"
 PARAMS = ("scene", "method", "preset", "ablation", "seed")
 METRICS = ("eval/psnr", "eval/ssim", "eval/lpips_01", "eval/flip", "eval/psnr_masked", "cost/train_seconds", "surfels")
+_MODE = "workflowType=machine_learning"
 _ATTRIBUTES = ("Created", "Duration")
 _EPOCH = 1  # milliseconds: the same view is the same tag, whoever writes it
 
@@ -52,14 +53,14 @@ def view_tags() -> Mapping[str, str]:
 
 
 def artifact_link(address: str, experiment_id: str, run_id: str, path: str) -> str:
-    """The page of a run's file or folder."""
-    return f"{address}/#/experiments/{experiment_id}/runs/{run_id}/artifacts/{path}"
+    """The page of a run's file or folder, in the mode of :func:`view_link`."""
+    return f"{address}/#/experiments/{experiment_id}/runs/{run_id}/artifacts/{path}?{_MODE}"
 
 
 def view_link(address: str, experiment_id: str) -> str:
     """The page of an experiment in this view, in MLflow's mode for model training."""
     where = f"{address}/#/experiments/{experiment_id}/runs"
-    return f"{where}?viewStateShareKey={VIEW_ID}&workflowType=machine_learning"
+    return f"{where}?viewStateShareKey={VIEW_ID}&{_MODE}"
 
 
 def _column(kind: str, name: str) -> str:

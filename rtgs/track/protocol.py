@@ -52,7 +52,8 @@ class RunInfo:
 
     ``fingerprint`` is that of the step, or of the last step of a variant. Unfinished runs of the same experiment whose
     process is gone are marked as killed when a new one opens. ``parent``: id of the run of the sweep it belongs to.
-    ``seconds_before``: of work that was done for it before it is opened; its duration has them.
+    ``seconds_before``: of work that was done for it before it is opened; its duration has them. ``announced``: id
+    of the run that :meth:`Tracking.announce` has shown for it.
     """
 
     experiment: str
@@ -61,6 +62,7 @@ class RunInfo:
     tags: Mapping[str, str] = field(default_factory=dict)
     parent: str = ""
     seconds_before: float = 0.0
+    announced: str = ""
 
 
 class Tracking(Protocol):
@@ -72,7 +74,13 @@ class Tracking(Protocol):
         ...
 
     def run(self, info: RunInfo) -> AbstractContextManager[Tracker]:
-        """A new run. Leaving the context normally ends it as finished, by an exception as failed (killed on Ctrl-C)."""
+        """A new run, or the announced one. Leaving the context normally ends it as finished, by an exception as failed
+        (killed on Ctrl-C)."""
+        ...
+
+    def announce(self, infos: Sequence[RunInfo]) -> AbstractContextManager[Mapping[str, Tracker]]:
+        """Runs, by fingerprint, that are shown as running while others do their work. On leaving, those that
+        :meth:`run` has not gone on with end as failed. Empty where nothing shows runs before they are opened."""
         ...
 
     def sweep(self, info: RunInfo) -> AbstractContextManager[Tracker]:

@@ -27,6 +27,7 @@ SECONDS |= {"judge": 4.0, "render": 4.0, "evaluate": 4.0, "report": 3.0}
 """What a step takes at 400 pixels on one core, where none of its kind was ever run here."""
 OTHER_SECONDS = 10.0
 TRAINING_STEP_SECONDS = {"plain": 0.03, "train_diffuse": 0.03, "train_reflection": 0.12, "train_shading": 0.06}
+TRAINING_STEP_SECONDS |= {"train_transmittance": 0.4}
 OTHER_TRAINING_STEP_SECONDS = 0.2
 _PRIOR_SECONDS = 20.0  # weight of the expectation against what was seen
 
@@ -73,7 +74,8 @@ def _method(params: Mapping[str, Any]) -> object:
 class PlanClock:
     """How much of a plan is done, by weight, and how long the rest will take.
 
-    What steps really took corrects the expectation of the others; the first seconds count little.
+    What trainings really took corrects the expectation of the rest; the first seconds count little. Other steps do not:
+    whether masks come from outlines or from a network says nothing of how fast this machine trains.
     """
 
     def __init__(self, plan: Plan, expectation: Expectation, lanes: int = 1, now: Callable[[], float] = time.monotonic):
@@ -81,6 +83,7 @@ class PlanClock:
         todo = [planned.step for planned in plan if not planned.hit]
         self.weights = {step.fingerprint: max(expectation.seconds(step), 0.01) for step in todo}
         self._left = dict(self.weights)
+        self._tells = {step.fingerprint for step in todo if training_steps(step.recipe) is not None}
         self._lanes = max(1, lanes)
         self._now = now
         self._expected = self._took = _PRIOR_SECONDS
@@ -102,7 +105,7 @@ class PlanClock:
         if weight is None:
             return
         self._since = self._now()
-        if took is not None:
+        if took is not None and fingerprint in self._tells:
             self._expected += weight
             self._took += took
 

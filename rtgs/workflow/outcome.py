@@ -44,10 +44,12 @@ class StepOutcome:
 
 @dataclass(frozen=True)
 class SweepOutcomes:
-    """All steps of a sweep by fingerprint, and what its merged plan had said of them."""
+    """All steps of a sweep by fingerprint, what its merged plan had said of them, and ids of the runs that the tracker
+    showed meanwhile, by fingerprint of their last step."""
 
     outcomes: Mapping[str, StepOutcome]
     planned: Mapping[str, PlannedStep] = field(default_factory=dict)
+    announced: Mapping[str, str] = field(default_factory=dict)
 
     @staticmethod
     def of(outcomes: Iterable[StepOutcome]) -> SweepOutcomes:

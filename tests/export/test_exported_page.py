@@ -7,7 +7,6 @@ import gzip
 import io
 import json
 import re
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,6 +25,7 @@ from rtgs.render.orbit import Orbit, Picture, orbit_cameras
 from rtgs.render.splats import render_splats
 from rtgs.train.held_out import psnr_of
 from tests.export.test_bake import some
+from tests.view import chromium
 
 DOWN = np.array([0.0, -1.0, 0.0])  # up in a capture whose y points down
 FRAME = upright(DOWN, np.array([0.0, 0.0, 1.0]))
@@ -145,7 +145,7 @@ def test_light_from_far_away_is_baked_as_it_is():
 @pytest.fixture(scope="module")
 def browser():
     api = pytest.importorskip("playwright.sync_api")
-    binary = shutil.which("chromium") or shutil.which("google-chrome") or shutil.which("chromium-browser")
+    binary = chromium.browser()
     if binary is None:
         pytest.skip("no Chromium here")
     software = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]

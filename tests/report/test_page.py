@@ -28,6 +28,7 @@ from rtgs.report.page import (
     ReportData,
     ReportView,
     StepLine,
+    _duration,
     config_lines,
     pick_views,
     render_report,
@@ -379,3 +380,10 @@ def test_charts_say_what_they_are() -> None:
     svgs = re.findall(r"<svg [^>]*>", render_report(full_data()))
     assert len(svgs) == 3
     assert all('role="img"' in svg and 'aria-label="' in svg for svg in svgs)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"), [(85.5, "85.5 s"), (244, "4 min 04 s"), (1878.4, "31 min"), (7300, "2 h 01 min")]
+)
+def test_durations_fit_a_tile(seconds, words):
+    assert _duration(seconds) == words

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 import subprocess
 from dataclasses import replace
 from pathlib import Path
@@ -17,8 +16,9 @@ from rtgs.report.figures import Curve
 from rtgs.report.files import link_files
 from rtgs.report.page import write_report
 from tests.report.test_page import full_data
+from tests.view.chromium import browser
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+CHROMIUM = browser()
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here")
 PROBE = """<script>
 const told = {};

@@ -32,7 +32,7 @@ def refused(root, *parts: str, **keys) -> str:
 
 
 def test_missing_folder(tmp_path):
-    refused(tmp_path / "nowhere", "capture folder .*nowhere does not exist", "correct scene.path")
+    refused(tmp_path / "nowhere", "capture folder .*nowhere does not exist", "correct scene.path", "rtgs get")
 
 
 def test_path_that_is_empty_or_a_file(tmp_path):

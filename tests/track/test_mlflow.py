@@ -215,3 +215,29 @@ def test_only_finished_runs_count_as_recorded(tracking):
     assert tracking.finished("rtgs/recorded", "d" * 64)
     assert not tracking.finished("rtgs/recorded", "e" * 64)
     assert not tracking.finished("rtgs/elsewhere", "d" * 64)
+
+
+def test_an_announced_run_is_seen_running_and_gone_on_with(tracking):
+    group = RunInfo("rtgs/live", "sweep", "sweep 2")
+    infos = [RunInfo("rtgs/live", name, name * 64, parent="p") for name in "ab"]
+    with tracking.sweep(group), tracking.announce(infos) as shown:
+        shown["a" * 64].params({"method": "2dgs"})
+        assert {run.info.run_name: run.info.status for run in runs(tracking, "rtgs/live")} == {
+            "sweep": "FINISHED",
+            "a": "RUNNING",
+            "b": "RUNNING",
+        }
+        MlflowTracking(tracking.root).reap()  # by the dashboard: these are alive
+        time.sleep(2.5)  # others' work
+        goes_on = RunInfo("rtgs/live", "renamed", "a" * 64, announced=shown["a" * 64].id, seconds_before=1.0)
+        with MlflowTracking(tracking.root).run(goes_on) as tracker:
+            tracker.metrics({"eval/psnr": 20.0})
+        with MlflowTracking(tracking.root).run(goes_on) as another:  # it has ended: a run is recorded in one only
+            assert another.id != tracker.id
+    found = {run.info.run_id: run for run in runs(tracking, "rtgs/live")}
+    mine, left = found[shown["a" * 64].id], found[shown["b" * 64].id]
+    assert (mine.info.run_name, mine.info.status, left.info.status) == ("renamed", "FINISHED", "FAILED")
+    assert mine.data.metrics == {"eval/psnr": 20.0}
+    assert mine.data.tags["mlflow.parentRunId"] == "p"
+    assert mine.info.end_time is not None
+    assert 1000 <= mine.info.end_time - mine.info.start_time < 2400  # its own work, not what it waited for

@@ -78,6 +78,15 @@ def test_the_clock_weighs_steps_and_learns(tmp_path):
     assert clock.done == pytest.approx(clock.total)
 
 
+def test_only_trainings_tell_how_fast_the_machine_is(tmp_path):
+    """Masks from outlines took a quarter of the expected time, and an hour of training was promised in 15 minutes."""
+    store = Store(tmp_path)
+    masks, long = Step("masks", 1, ToyParams(1.0), train), training("2dgs", 1000)
+    clock = PlanClock(make_plan([masks, long], store), Expectation(store), now=lambda: 0.0)
+    clock.finish(masks.fingerprint, 1.0)
+    assert clock.left() == pytest.approx(30)
+
+
 def test_workers_share_the_work_while_there_is_enough(tmp_path):
     store = Store(tmp_path)
     steps = [training("2dgs", 1000, seed) for seed in range(4)]

@@ -111,8 +111,8 @@ def drawn_kinds(path: Path) -> tuple[str, ...]:
 def _parse(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise PrepareError(
-            f"{path} does not exist: write the boxes, clicks or corners into it (docs/prepare.md shows how), or name "
-            "it with masks.drawn.file"
+            f"{path} does not exist: write the boxes, clicks or corners into it (docs/prepare.md shows how, `rtgs "
+            "outline` has a page for it), or name it with masks.drawn.file"
         )
     try:
         content = load_json(path) if path.suffix.lower() == ".json" else load_yaml(path)

@@ -133,7 +133,10 @@ class DrawnMaker(PlainMaker):
         if not self._settings.carry or len(self._marked) < _CARRY_VIEWS:
             return None
         if not self._carved:
-            self._hull, self._carved = carve(self._marked, self._clean, 0.0), True
+            found = carve(self._marked, self._clean, 0.0)
+            # An outline is one polygon: the photos show one object.
+            outlined = found is not None and all(len(marks.outline) for marks in self._cutouts.values())
+            self._hull, self._carved = found.largest_part() if found is not None and outlined else found, True
         return self._hull
 
 

@@ -109,6 +109,19 @@ class Hull:
         wide = np.ones((size + 2, size + 2), np.uint8)
         return cv2.morphologyEx(closed, cv2.MORPH_CLOSE, wide).astype(bool)
 
+    def largest_part(self) -> Hull:
+        """The voxels that hang together with most others. Where few photos look, a hull has loose pieces that are no
+        object."""
+        from scipy import ndimage
+
+        cells = np.rint((self.points - self.points.min(axis=0)) / self.voxel).astype(int)
+        grid = np.zeros(cells.max(axis=0) + 1, dtype=bool)
+        grid[tuple(cells.T)] = True
+        labels = np.zeros(grid.shape, dtype=np.int32)
+        ndimage.label(grid, np.ones((3, 3, 3)), output=labels)
+        parts = labels[tuple(cells.T)]
+        return Hull(self.points[parts == np.bincount(parts).argmax()], self.voxel)
+
     def pixels(self, mask: SmallMask, depth: float) -> float:
         """Size of a voxel at ``depth`` in pixels of a small mask."""
         return self.voxel * mask.lens.pinhole().params[0] / max(depth, 1e-9)

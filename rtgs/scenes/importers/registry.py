@@ -27,7 +27,8 @@ def capture_root(settings: SceneSettings) -> Path:
         return embedded_capture(settings.path.removeprefix(EMBEDDED_PREFIX))
     root = Path(os.path.expandvars(settings.path)).expanduser()
     if not root.exists():
-        raise CaptureError(f"capture folder {root} does not exist (from {Path.cwd()}): correct scene.path")
+        there = "correct scene.path, or let `rtgs get` bring a capture"
+        raise CaptureError(f"capture folder {root} does not exist (from {Path.cwd()}): {there}")
     if not root.is_dir():
         raise CaptureError(f"capture {root} is a file: scene.path names the folder that holds images and model")
     return root

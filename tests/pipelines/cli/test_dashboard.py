@@ -54,8 +54,9 @@ def test_every_experiment_is_listed_with_its_page_and_best_run(tmp_path):
     assert re.search(rf"{ADDRESS}/#/experiments/\d+/runs\?viewStateShareKey={VIEW_ID}&workflowType=machine", table)
     (steps,) = [line for line in lines if "rtgs/steps: 1 executed steps" in line]
     assert "viewStateShareKey" not in steps
-    assert any(re.search(r"its pictures: .*/runs/\w+/artifacts/images$", line) for line in lines)
-    assert any(re.search(rf"newest sweep: .*/artifacts/tables/{FIGURES}.json$", line) for line in lines)
+    assert lines[-1] == steps  # what is compared comes first
+    assert any(re.search(r"its pictures: .*/runs/\w+/artifacts/report\.html\?workflow", line) for line in lines)
+    assert any(re.search(rf"newest sweep: .*/artifacts/tables/{FIGURES}.json\?workflow", line) for line in lines)
     assert all(word in GUIDE for word in ("Model metrics", "tables/eval.json", "report.html", f"{FIGURES}.json"))
 
 
@@ -152,7 +153,7 @@ def test_the_rest_api_gives_the_view_the_order_and_true_durations(served):
 def test_the_table_of_a_sweep_is_where_the_link_leads(served):
     address, printed = served
     (link,) = [line.split()[-1] for line in printed if "table of the newest sweep" in line]
-    found = re.search(r"/runs/(\w+)/artifacts/(.+)$", link)
+    found = re.search(r"/runs/(\w+)/artifacts/(.+)\?", link)
     assert found is not None
     files = asked(address, f"artifacts/list?run_id={found[1]}&path=tables")["files"]
     assert [file["path"] for file in files] == [found[2]]

@@ -14,6 +14,7 @@ import torch
 
 from pipelines.cli.export import ExportWords, parse_words
 from pipelines.cli.main import main
+from pipelines.publishing.exported_page import BLURRED
 from pipelines.publishing.exported_run import BakeRecord, export_run
 from rtgs.core.errors import RtgsError
 from rtgs.export.bake import BAKE_VERSION, BakeSettings
@@ -57,6 +58,22 @@ def test_one_ply_of_all_layers_and_what_it_loses(layered, capsys):
     row = told.splitlines()[-1].split()
     assert row[:4] == ["ply", f"{path.stat().st_size / 1e6:.2f}", "MB", f"{len(baked):,}"]
     assert row[4:6] == ["the", "same"]
+
+
+def test_what_mirrors_lose_is_printed_and_the_page_says_that_they_are_blurred(
+    layered, plain, capsys, monkeypatch, tmp_path
+):
+    monkeypatch.setattr("pipelines.publishing.exported_run._MIRRORS", -1.0)  # all pixels are mirrors
+    assert main(["export", "mirror", "steps=20", "format=ply,html", f"out={tmp_path}"]) == 0
+    record = json.loads((tmp_path / "mirror.json").read_text())
+    assert record["mirrors"] == pytest.approx(record["psnr"], abs=1.0)  # of all pixels, not the mean over views
+    assert f"{record['mirrors']:.2f} dB where it mirrors" in capsys.readouterr().out
+    assert BLURRED in (tmp_path / "mirror.html").read_text()
+    monkeypatch.setattr("pipelines.publishing.exported_run._MIRRORS", 1.0)  # none is
+    assert main(["export", "mirror", "steps=20", "splats=400", f"out={tmp_path}"]) == 0
+    assert "where it mirrors" not in capsys.readouterr().out
+    assert main(["export", "plain", "format=html", f"out={tmp_path}"]) == 0
+    assert BLURRED not in (tmp_path / "plain.html").read_text()
 
 
 def test_the_fit_is_kept_until_the_words_or_the_file_change(layered):

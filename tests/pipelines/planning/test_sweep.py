@@ -22,7 +22,9 @@ from pipelines.cli.main import main
 from pipelines.planning.sweep import Sweep, SweepTask
 from rtgs.config.names import overridden
 from rtgs.core.errors import RtgsError
+from rtgs.track.mlflow import MlflowTracking
 from rtgs.workflow import StepOutcome, Store, SweepOutcomes
+from rtgs.workflow.engine import DaskExecutor
 
 QUICK = (
     "method=2dgs",
@@ -140,6 +142,33 @@ def test_a_sweep_is_one_plan_and_every_job_has_its_results(capture, tmp_path, ca
     missing = [line for line in lines if line.startswith("train_diffuse") and "to run" in line]
     assert len(missing) == 4
     assert all(line.endswith("method.loss.l1: 0.8 -> 0.7") for line in missing)
+
+
+def test_the_runs_of_a_sweep_are_seen_while_workers_are_at_it(capture, tmp_path, monkeypatch):
+    original, seen = DaskExecutor.attempt, []
+
+    def watched(self, plan):
+        seen.append(_runs(tmp_path))
+        return original(self, plan)
+
+    monkeypatch.setattr(DaskExecutor, "attempt", watched)
+    words = ["run", "--multirun", f"scene={capture}", *QUICK, "tracking=mlflow", "seed=0,1"]
+    assert main([*words, "hydra.launcher.workers=1"]) == 0
+    ((group, *children),) = (sorted(found, key=lambda run: run.info.status) for found in seen)
+    assert [run.info.status for run in (group, *children)] == ["FINISHED", "RUNNING", "RUNNING"]
+    assert {run.data.params["seed"] for run in children} == {"0", "1"}
+    assert {run.data.tags["mlflow.parentRunId"] for run in children} == {group.info.run_id}
+    after = {run.info.run_id: run for run in _runs(tmp_path)}
+    assert set(after) == {run.info.run_id for run in (group, *children)}  # none is recorded twice
+    assert {run.info.status for run in after.values()} == {"FINISHED"}
+    assert all("eval/psnr" in after[run.info.run_id].data.metrics for run in children)
+
+
+def _runs(root: Path) -> list:
+    client = MlflowTracking(root).client
+    experiment = client.get_experiment_by_name("rtgs/runs")
+    assert experiment is not None
+    return list(client.search_runs([experiment.experiment_id]))
 
 
 def test_the_plan_of_a_sweep_names_the_jobs_that_could_not_start(capture, capsys):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from rtgs.prepare.masks.hull import (
+    Hull,
     SmallMask,
     carve,
     common_hull,
@@ -156,3 +157,11 @@ def test_signed_distance():
     assert distance[4, 0] == pytest.approx(-2.5, abs=0.1)
     assert (signed_distance(np.ones((4, 4), dtype=bool)) > 4).all()
     assert (signed_distance(np.zeros((4, 4), dtype=bool)) < -4).all()
+
+
+def test_loose_pieces_are_no_part_of_an_outlined_object():
+    axes = np.stack(np.meshgrid(*[np.arange(6) * 0.1] * 3, indexing="ij"), -1).reshape(-1, 3)
+    loose = axes[:30] + np.array([2.0, 0.0, 0.0])
+    whole = Hull(np.concatenate((loose, axes)), 0.1).largest_part()
+    np.testing.assert_allclose(whole.points, axes)
+    assert whole.voxel == 0.1

@@ -243,7 +243,7 @@ def test_the_plan_says_why_there_are_no_masks(capture, tmp_path, root, weights, 
     assert "nothing reads them (method.loss.specular is 0" in plan(capsys, scene, "method=2dgs")["masks"]
     missing = plan(capsys, scene, reads)["masks"]
     assert "weights missing: grounding_dino/model.onnx" in missing
-    assert "masks.yaml beside the photos does without" in missing
+    assert "without: masks.yaml beside the photos (`rtgs outline`)" in missing
     assert "masks=none" in plan(capsys, scene, reads, "masks=none")["masks"]
     assert "masks are given (48 of 48 photos)" in plan(capsys, "scene=demo", reads)["masks"]
     assert "the scene has no glass" in plan(capsys, "scene=matte_room", reads)["masks"]

@@ -1,0 +1,92 @@
+"""``rtgs outline FOLDER``: poses for photos that have none, and a page on which the glass is outlined."""
+
+from __future__ import annotations
+
+import logging
+import shlex
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rtgs.core.errors import RtgsError
+
+if TYPE_CHECKING:
+    from rtgs.config.schema import RunConfig
+    from rtgs.prepare.source import Source
+
+PAGE = "outline.html"
+PHOTOS = 8
+
+HELP = f"""rtgs outline FOLDER | VIDEO | scene=NAME [key=value of `rtgs run`]
+
+Finds poses where there are none (`rtgs run` takes them from the cache), chooses {PHOTOS} photos from different sides,
+and writes a page beside the capture, {PAGE}: open it, click round the glass in three photos or more, save
+masks.yaml beside it. `rtgs run` makes the masks of all photos from that."""
+
+
+def outline(words: Sequence[str]) -> int:
+    """The command; returns the exit code.
+
+    Raises:
+        RtgsError: a word that is not understood.
+        CaptureError, PrepareError: the capture cannot be read, or its poses not be found.
+    """
+    if not words or words[0] in ("-h", "--help"):
+        print(HELP)
+        return 0 if words else 2
+    from pipelines.cli.app import short
+    from pipelines.planning.inspection import Inspections
+    from rtgs.config import compose
+    from rtgs.config.words import friendly_overrides
+    from rtgs.prepare.masks.drawn import read_drawing
+    from rtgs.prepare.masks.outline_page import far_apart, write_outline_page
+    from rtgs.prepare.source import mark_file
+    from rtgs.scenes.importers.registry import read_capture
+    from rtgs.scenes.splits import select_views
+
+    if words[0].startswith("-"):
+        raise RtgsError(f"rtgs outline: {words[0]} is no word of it\n\n{HELP}")
+    first = words[0] if "=" in words[0] else f"scene.path={words[0]}"
+    config, _ = compose(friendly_overrides([first, *words[1:]]))
+    inspection = Inspections().of(config.scene, config.sfm)
+    if inspection.given_masks:
+        print(f"{config.scene.name}: {inspection.given_masks}: they are taken, an outline would not be read")
+        return 0
+    settings = config.scene
+    if not inspection.source.has_poses:
+        settings = replace(settings, path=str(_posed(config, inspection.source)))
+    views = select_views(read_capture(settings), settings)
+    target = mark_file(inspection.source, config.masks)
+    drawing = read_drawing(target, [view.name for view in views]) if target.is_file() else None
+    chosen = {views[row].name for row in far_apart([view.center for view in views], PHOTOS)}
+    chosen |= set(drawing.marked) if drawing is not None else set()
+    page = target.with_name(PAGE)
+    write_outline_page(page, config.scene.name, [view for view in views if view.name in chosen], target, drawing)
+    print(f"{short(page)}: open it in a browser, outline the glass in three photos or more, save the file as")
+    print(f"{short(target)}; then: rtgs run {shlex.quote(words[0])} method=rtgs preset=quick")
+    return 0
+
+
+def _posed(config: RunConfig, source: Source) -> Path:
+    """The capture that the search of poses makes; the same step as that of a run, so it is not done twice."""
+    from pipelines.planning.plan import remote_store
+    from pipelines.steps import sfm
+    from rtgs.workflow import InlineExecutor, Store, make_plan
+
+    _tell()
+    store, remote = Store(config.paths.store), remote_store(config)
+    step = sfm.sfm_step(source, config.scene, config.sfm)
+    plan = make_plan((step,), store, remote)
+    return InlineExecutor(store, None, remote).execute(plan)[-1].folder
+
+
+def _tell() -> None:
+    """What the step says, as a run prints it."""
+    log = logging.getLogger("rtgs")
+    if not log.handlers and not logging.getLogger().handlers:
+        told = logging.StreamHandler(sys.stderr)
+        told.setFormatter(logging.Formatter("%(message)s"))
+        log.addHandler(told)
+    log.setLevel(logging.INFO)
