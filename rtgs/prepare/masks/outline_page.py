@@ -97,7 +97,7 @@ def _kept(drawing: Drawing | None, sizes: Mapping[str, tuple[int, int]]) -> Mapp
     if drawing is None:
         return {"panes": {}, "cutouts": {}}
 
-    def shares(points: object, name: str) -> list[list[float]]:
+    def shares(points: np.ndarray | Sequence[float], name: str) -> list[list[float]]:
         return drawing.shares(np.reshape(points, (-1, 2)), sizes[name]).round(5).tolist()
 
     def others(cutout: Cutout, name: str) -> Mapping[str, object]:
