@@ -64,7 +64,7 @@ def write_outline_page(
         data=json.dumps(data).replace("<", "\\u003c"),
     )
     with whole_file(path) as partial:
-        partial.write_text(text, encoding="utf-8")
+        partial.write_text(text, encoding="utf-8", errors="replace")  # a folder's name may be no text
 
 
 def _as_taken(view: CaptureView, original: Lens | None) -> Image.Image:

@@ -107,6 +107,34 @@ def test_photos_that_were_undistorted_are_shown_as_they_were_taken(tmp_path):
     np.testing.assert_allclose((columns.mean() + 0.5, rows.mean() + 0.5), taken[0], atol=0.8)
 
 
+@pytest.mark.skipif(chromium.browser() is None, reason="no Chromium (Debian: apt install chromium)")
+def test_any_name_and_all_marks_are_in_the_file_that_the_page_gives(capture, tmp_path):
+    frames = json.loads((capture / "transforms.json").read_text())
+    names = ["photos/<img src=x>.jpg", "photos/a\"'{x}.jpg", "photos/on: [1] #\u2028.jpg", "photos/\U0001f600.jpg"]
+    for frame, name in zip(frames["frames"], names):
+        (capture / frame["file_path"]).rename(capture / name)
+        frame["file_path"] = name
+    (capture / "transforms.json").write_text(json.dumps(frames))
+    pane = "panes:\n  door:\n" + "".join(f"    a {k}.jpg: [[6, 4], [30, 4], [30, 36]]\n" for k in (4, 5))
+    (capture / "masks.yaml").write_text(pane + "cutouts: {a 6.jpg: {box: [6, 4, 30, 36], inside: [[12, 8]]}}\n")
+    before = read_drawing(capture / "masks.yaml", [f"photos/a {k}.jpg" for k in (4, 5, 6)])
+    main(["outline", str(capture)])
+    with chromium.open_tab((capture / PAGE).as_uri(), tmp_path / "profile") as tab:
+        tab.wait("!!document.querySelector('nav button')")
+        tab.evaluate("photos.forEach((photo) => { photo.outline = [[.1, .1], [.9, .1], [.9, .9]]; }); show();")
+        text = tab.evaluate("document.querySelector('textarea').value")
+    (capture / "masks.yaml").write_text(text, encoding="utf-8")
+    drawing, size = read_drawing(capture / "masks.yaml", None), np.array(SIZE)
+    assert set(drawing.marked) == {photo["name"] for photo in photos(capture / PAGE)}
+    assert any(name in drawing.cutouts for name in names)
+    for name, corners in before.panes["door"].items():
+        np.testing.assert_allclose(drawing.panes["door"][name] * size, corners, atol=0.01)
+    mine = drawing.cutouts["photos/a 6.jpg"]
+    np.testing.assert_allclose(np.reshape(mine.box, (2, 2)) * size, [[6, 4], [30, 36]], atol=0.01)
+    assert len(mine.inside) == 1
+    assert len(mine.outline) == 3
+
+
 def test_the_run_that_follows_has_the_same_words():
     assert _of_run(["a b", "sfm.seed=1"]) == ["a b", "sfm.seed=1", "method=rtgs", "preset=quick"]
     assert _of_run(["a", "preset=smoke"]) == ["a", "preset=smoke", "method=rtgs"]
