@@ -57,7 +57,8 @@ def outline(words: Sequence[str]) -> int:
         return 0
     settings = config.scene
     if not inspection.source.has_poses:
-        settings = replace(settings, path=str(_posed(config, inspection.source)))
+        folder = str(_posed(config, inspection.source))  # laid out as the search does, not as the photos lie
+        settings = replace(settings, path=folder, format="auto", images_dir=None, model_dir=None)
     capture = read_capture(settings)
     views = select_views(capture, settings)
     target = mark_file(inspection.source, config.masks)

@@ -6,6 +6,7 @@ import base64
 import io
 import json
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from pipelines.cli.outline import PAGE, PHOTOS, _of_run
 from rtgs.prepare.masks.drawn import read_drawing
 from rtgs.prepare.masks.outline_page import far_apart, write_outline_page
 from rtgs.scenes.capture import CaptureView
+from rtgs.scenes.importers import registry
 from rtgs.scenes.undistort import Lens, project, unproject
 from tests.view import chromium
 
@@ -133,6 +135,17 @@ def test_any_name_and_all_marks_are_in_the_file_that_the_page_gives(capture, tmp
     np.testing.assert_allclose(np.reshape(mine.box, (2, 2)) * size, [[6, 4], [30, 36]], atol=0.01)
     assert len(mine.inside) == 1
     assert len(mine.outline) == 3
+
+
+def test_photos_in_a_folder_that_is_named_have_a_page(capture, tmp_path, monkeypatch):
+    bare = tmp_path / "bare"
+    shutil.copytree(capture / "photos", bare / "taken")
+    monkeypatch.setattr("pipelines.cli.outline._posed", lambda config, source: capture)
+    read, asked = registry.read_capture, []
+    monkeypatch.setattr(registry, "read_capture", lambda settings: asked.append(settings) or read(settings))
+    assert main(["outline", str(bare), "scene.images_dir=taken"]) == 0
+    assert [settings.images_dir for settings in asked] == [None]  # poses' folder has images/ only
+    assert len(photos(bare / PAGE)) == PHOTOS
 
 
 def test_the_run_that_follows_has_the_same_words():
