@@ -42,6 +42,7 @@ def outline(words: Sequence[str]) -> int:
     from rtgs.config.words import friendly_overrides
     from rtgs.prepare.masks.drawn import read_drawing
     from rtgs.prepare.masks.outline_page import far_apart, write_outline_page
+    from rtgs.prepare.poses.export import read_lenses
     from rtgs.prepare.source import mark_file
     from rtgs.scenes.importers.registry import read_capture
     from rtgs.scenes.splits import select_views
@@ -56,17 +57,27 @@ def outline(words: Sequence[str]) -> int:
         return 0
     settings = config.scene
     if not inspection.source.has_poses:
-        settings = replace(settings, path=str(_posed(config, inspection.source)))
-    views = select_views(read_capture(settings), settings)
+        folder = str(_posed(config, inspection.source))  # laid out as the search does, not as the photos lie
+        settings = replace(settings, path=folder, format="auto", images_dir=None, model_dir=None)
+    capture = read_capture(settings)
+    views = select_views(capture, settings)
     target = mark_file(inspection.source, config.masks)
     drawing = read_drawing(target, [view.name for view in views]) if target.is_file() else None
     chosen = {views[row].name for row in far_apart([view.center for view in views], PHOTOS)}
     chosen |= set(drawing.marked) if drawing is not None else set()
     page = target.with_name(PAGE)
-    write_outline_page(page, config.scene.name, [view for view in views if view.name in chosen], target, drawing)
+    shown = [view for view in views if view.name in chosen]
+    write_outline_page(page, config.scene.name, shown, target, drawing, read_lenses(capture.root))
     print(f"{short(page)}: open it in a browser, outline the glass in three photos or more, save the file as")
-    print(f"{short(target)}; then: rtgs run {shlex.quote(words[0])} method=rtgs preset=quick")
+    print(f"{short(target)}; then: rtgs run {shlex.join(_of_run(words))}")
     return 0
+
+
+def _of_run(words: Sequence[str]) -> list[str]:
+    """The same capture with the same settings, whose poses are in the cache."""
+    keys = {word.partition("=")[0] for word in words[1:]}
+    usual = {"method": "rtgs", "preset": "quick"}
+    return [*words, *(f"{key}={value}" for key, value in usual.items() if key not in keys)]
 
 
 def _posed(config: RunConfig, source: Source) -> Path:

@@ -17,6 +17,7 @@ from rtgs.mesh.settings import COVERED
 from rtgs.mesh.triangles import TriangleMesh
 
 _MOST_REACHES = 0.9  # quantile
+_LEAST_CROSSING = 1e-4  # of the smallest eigenvalue; two rays one degree apart
 
 
 def bounding(mask: Tensor | None) -> Tensor | None:
@@ -172,12 +173,19 @@ def direction_spread(views: Sequence[MaskView]) -> float:
     return float(np.degrees(np.arccos(np.clip((unit @ unit.T).min(), -1, 1))))
 
 
+def crossing(views: Sequence[MaskView]) -> bool:
+    """Whether the rays through the masks' middles say how far away the object is: not one ray, nor all but parallel."""
+    axes = np.stack([_middle_ray(view) for view in views])
+    return bool(np.linalg.eigvalsh(np.eye(3) - axes.T @ axes / len(axes))[0] > _LEAST_CROSSING)
+
+
 def enclosing_sphere(views: Sequence[MaskView]) -> tuple[np.ndarray, float]:
     """Centre (3,) float64 and radius, world units, of a sphere around what the masks show.
 
     The centre is :func:`focus_point`. The farthest ray of a mask's pixels is as far from it as the object reaches in
     that view; the radius is the 90th percentile over the views, so that a few broken masks do not blow it up. Views in
-    which the object reaches the image border count only where it does so in all.
+    which the object reaches the image border count only where it does so in all. The rays must cross
+    (:func:`crossing`).
     """
     center = focus_point(views)
     whole = [view for view in views if not view.cut] or list(views)

@@ -17,6 +17,7 @@ from rtgs.methods.spec import HARMONICS, MethodSpec
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from rtgs.core.decisions import Decision
     from rtgs.methods.model import Model
     from rtgs.methods.parts.base import BaseSet
     from rtgs.methods.spec import Setup
@@ -62,15 +63,15 @@ def build(setup: Setup) -> Model:
     return Model(setup, (base, mirror), terms)
 
 
-def scope_terms(base: BaseSet, own: DeferredSettings, scene: Scene) -> Sequence[LossTerm]:
-    """The mean m of the Gaussians whose centres are outside of the scope, where there is one."""
+def scope_terms(base: BaseSet, own: DeferredSettings, scene: Scene) -> Sequence[LossTerm | Decision]:
+    """The mean m of the Gaussians whose centres are outside of the scope, or why there is none."""
     from rtgs.methods.parts.cubemap_mirror import WEIGHT
-    from rtgs.methods.scope import scope_of
+    from rtgs.methods.scope import scope_of, why_no_scope
     from rtgs.train.terms import LossTerm
 
     scope = scope_of(own, scene) if own.outside > 0 else None
     if scope is None:
-        return ()
+        return why_no_scope(own, scene) if own.outside > 0 else ()
 
     def outside(rendered: object, view: object) -> Tensor | None:
         gaussians = base.set.gaussians

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
+from rtgs.core.decisions import Decision
 from rtgs.core.refuse import refuse_bad_point, refuse_outside, refuse_unknown_words, refuse_unless
 
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from rtgs.mesh.silhouettes import MaskView
     from rtgs.scenes.scene import Scene
 
 _STATE = "scope"  # (4,) float64 centre and radius
@@ -78,10 +80,33 @@ def scope_of(settings: ScopeSettings, scene: Scene) -> Scope | None:
     """
     if settings.scope == "sphere":
         return Scope(settings.scope_center, settings.scope_radius) if settings.scope_radius > 0 else None
-    from rtgs.mesh.silhouettes import enclosing_sphere, mask_set, why_unbounded
+    return None if why_no_scope(settings, scene) else _around_masks(scene)
 
-    masks = [view.mask for view in scene.train]
-    if why_unbounded(masks):
-        return None
-    center, radius = enclosing_sphere(mask_set([view.camera for view in scene.train], masks).views)
+
+def why_no_scope(settings: ScopeSettings, scene: Scene) -> tuple[Decision, ...]:
+    """What is said where masks were to give a scope and do not; empty: they do, or were not asked.
+
+    Raises:
+        RtgsError: a mask does not fit its picture.
+    """
+    from rtgs.mesh.silhouettes import crossing, why_unbounded
+
+    if settings.scope != "masks":
+        return ()
+    why = why_unbounded([view.mask for view in scene.train])
+    if not why and not crossing(_mask_views(scene)):
+        why = "all masks are seen from one side: they do not say how far away the object is"
+    return (Decision("no scope, all may reflect", f"{why} (method.own.scope=masks)"),) if why else ()
+
+
+def _around_masks(scene: Scene) -> Scope:
+    from rtgs.mesh.silhouettes import enclosing_sphere
+
+    center, radius = enclosing_sphere(_mask_views(scene))
     return Scope(tuple(center.tolist()), radius)
+
+
+def _mask_views(scene: Scene) -> Sequence[MaskView]:
+    from rtgs.mesh.silhouettes import mask_set
+
+    return mask_set([view.camera for view in scene.train], [view.mask for view in scene.train]).views

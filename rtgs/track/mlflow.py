@@ -194,7 +194,11 @@ class MlflowTracking:
         yield info.announced, lambda: start + int(1000 * (info.seconds_before + time.time() - began))
 
     def _runs(self, run_id: str) -> bool:
-        return bool(run_id) and self.client.get_run(run_id).info.status == "RUNNING"
+        """Whether a run is under way, and not deleted by a person who saw it."""
+        if not run_id:
+            return False
+        info = self.client.get_run(run_id).info
+        return info.status == "RUNNING" and info.lifecycle_stage == "active"
 
     @contextmanager
     def announce(self, infos: Sequence[RunInfo]) -> Iterator[Mapping[str, Tracker]]:

@@ -74,6 +74,23 @@ def test_a_scene_without_masks_has_no_scope_and_a_typed_one_needs_none():
     assert typed.holds(torch.tensor([[1.4, 0.0, 0.0], [0.4, 0.0, 0.0]])).tolist() == [True, False]
 
 
+@pytest.mark.parametrize("name", ["ref_gs", "3dgs_dr"])
+def test_masks_from_one_side_give_no_scope_and_that_is_said(name):
+    made = tiny()
+    plain = replace(recipe(name), own=MASKS, loss=replace(recipe().loss, normal=0.0))
+    (first, *_) = masked(made).scene.train
+    one_place = replace(made, scene=replace(made.scene, train=type(made.scene.train)([first] * 3)))
+    for seen, why in (
+        (masked(every=100), "seen from one side"),
+        (one_place, "seen from one side"),
+        (made, "there are no masks"),
+    ):
+        assert scope_of(ScopeSettings(scope="masks"), seen.scene) is None
+        (said,) = (each for each in new_method(plain, seen, schedule()).decisions if "scope" in each.what)
+        assert why in said.why
+    assert "no scope" not in str(new_method(plain, masked(), schedule()).decisions)
+
+
 @pytest.mark.parametrize("settings", [DeferredSettings, FeatureSettings])
 def test_masks_and_a_typed_sphere_exclude_each_other(settings):
     assert not settings().scoped

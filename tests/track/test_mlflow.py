@@ -4,6 +4,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -241,3 +242,13 @@ def test_an_announced_run_is_seen_running_and_gone_on_with(tracking):
     assert mine.data.tags["mlflow.parentRunId"] == "p"
     assert mine.info.end_time is not None
     assert 1000 <= mine.info.end_time - mine.info.start_time < 2400  # its own work, not what it waited for
+
+
+def test_an_announced_run_that_a_person_deletes_is_begun_anew(tracking):
+    info = RunInfo("rtgs/deleted", "a", "a" * 64)
+    with tracking.announce([info, replace(info, fingerprint="b" * 64)]) as shown:
+        for tracker in shown.values():
+            tracking.client.delete_run(tracker.id)
+        with tracking.run(replace(info, announced=shown["a" * 64].id)) as tracker:
+            tracker.metrics({"eval/psnr": 20.0})
+    assert [run.info.status for run in runs(tracking, "rtgs/deleted")] == ["FINISHED"]

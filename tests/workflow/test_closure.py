@@ -16,7 +16,8 @@ from rtgs.workflow.closure import SourceTree
 from rtgs.workflow.sources import SourceLock, accept_sources, check_sources
 from tests.pipelines.accept_steps import ROOT, project
 
-OF_NO_STEP = ("rtgs/fetch/captures/", "rtgs/export/web/")  # what `rtgs get` lists; pages of `rtgs export`
+# What `rtgs get` lists; pages of `rtgs export` and of `rtgs outline`.
+OF_NO_STEP = ("rtgs/fetch/captures/", "rtgs/export/web/", "rtgs/prepare/masks/outline.html")
 HELD_BY_RECIPES = ("rtgs/scenes/data/",)  # captures: the recipe of an import holds the digest of their files
 NOT_READ = (".pyi", ".so", ".pyd", ".pyc", ".typed")
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import base64
+import io
 import json
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +14,12 @@ import pytest
 from PIL import Image
 
 from pipelines.cli.main import main
-from pipelines.cli.outline import PAGE, PHOTOS
+from pipelines.cli.outline import PAGE, PHOTOS, _of_run
 from rtgs.prepare.masks.drawn import read_drawing
-from rtgs.prepare.masks.outline_page import far_apart
+from rtgs.prepare.masks.outline_page import far_apart, write_outline_page
+from rtgs.scenes.capture import CaptureView
+from rtgs.scenes.importers import registry
+from rtgs.scenes.undistort import Lens, project, unproject
 from tests.view import chromium
 
 SIZE = (60, 40)
@@ -37,10 +43,14 @@ def capture(tmp_path, monkeypatch) -> Path:
     return folder
 
 
-def photos(page: Path) -> list[dict]:
-    found = re.search(r'id="photos">(.*?)</script>', page.read_text(encoding="utf-8"), re.DOTALL)
+def data(page: Path) -> dict:
+    found = re.search(r'id="data">(.*?)</script>', page.read_text(encoding="utf-8"), re.DOTALL)
     assert found is not None
     return json.loads(found[1])
+
+
+def photos(page: Path) -> list[dict]:
+    return data(page)["photos"]
 
 
 def test_chosen_places_lie_far_apart():
@@ -69,6 +79,78 @@ def test_outlines_that_there_are_can_be_mended(capture):
     assert main(["outline", str(capture)]) == 0
     (mine,) = (photo for photo in photos(capture / PAGE) if photo["name"] == "photos/a 3.jpg")
     np.testing.assert_allclose(mine["outline"], [[0.1, 0.1], [0.5, 0.1], [0.5, 0.9]])
+
+
+def test_marks_that_are_no_outlines_stay(capture):
+    pane = "panes:\n  door:\n" + "".join(f"    a {k}.jpg: [[6, 4], [30, 4], [30, 36]]\n" for k in (3, 5))
+    (capture / "masks.yaml").write_text(pane + "cutouts: {a 4.jpg: {box: [6, 4, 30, 36], inside: [[12, 8]]}}\n")
+    assert main(["outline", str(capture)]) == 0
+    corners = [[0.1, 0.1], [0.5, 0.1], [0.5, 0.9]]
+    assert data(capture / PAGE)["kept"] == {
+        "panes": {"door": {"photos/a 3.jpg": corners, "photos/a 5.jpg": corners}},
+        "cutouts": {"photos/a 4.jpg": {"box": [0.1, 0.1, 0.5, 0.9], "inside": [[0.2, 0.2]]}},
+    }
+
+
+def test_photos_that_were_undistorted_are_shown_as_they_were_taken(tmp_path):
+    lens = Lens("SIMPLE_RADIAL", 300, 200, (220.0, 150.0, 100.0, 0.25))
+    flat = Lens("PINHOLE", 300, 200, (220.0, 220.0, 150.0, 100.0))
+    taken = np.array([[250.0, 160.0]])  # where a person sees a dot, before undistortion
+    ((x, y),) = project(flat, unproject(lens, taken))
+    assert abs(x - 250) > 5  # it matters
+    pixels = np.zeros((200, 300, 3), np.uint8)
+    pixels[round(y) - 3 : round(y) + 3, round(x) - 3 : round(x) + 3] = 255
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    view = CaptureView("a.png", tmp_path / "a.png", np.eye(3), np.zeros(3), flat)
+    write_outline_page(tmp_path / PAGE, "a", [view], tmp_path / "masks.yaml", None, {"a.png": lens})
+    (photo,) = photos(tmp_path / PAGE)
+    with Image.open(io.BytesIO(base64.b64decode(photo["picture"].partition(",")[2]))) as picture:
+        rows, columns = np.nonzero(np.asarray(picture)[..., 0] > 128)
+    np.testing.assert_allclose((columns.mean() + 0.5, rows.mean() + 0.5), taken[0], atol=0.8)
+
+
+@pytest.mark.skipif(chromium.browser() is None, reason="no Chromium (Debian: apt install chromium)")
+def test_any_name_and_all_marks_are_in_the_file_that_the_page_gives(capture, tmp_path):
+    frames = json.loads((capture / "transforms.json").read_text())
+    names = ["photos/<img src=x>.jpg", "photos/a\"'{x}.jpg", "photos/on: [1] #\u2028.jpg", "photos/\U0001f600.jpg"]
+    for frame, name in zip(frames["frames"], names):
+        (capture / frame["file_path"]).rename(capture / name)
+        frame["file_path"] = name
+    (capture / "transforms.json").write_text(json.dumps(frames))
+    pane = "panes:\n  door:\n" + "".join(f"    a {k}.jpg: [[6, 4], [30, 4], [30, 36]]\n" for k in (4, 5))
+    (capture / "masks.yaml").write_text(pane + "cutouts: {a 6.jpg: {box: [6, 4, 30, 36], inside: [[12, 8]]}}\n")
+    before = read_drawing(capture / "masks.yaml", [f"photos/a {k}.jpg" for k in (4, 5, 6)])
+    main(["outline", str(capture)])
+    with chromium.open_tab((capture / PAGE).as_uri(), tmp_path / "profile") as tab:
+        tab.wait("!!document.querySelector('nav button')")
+        tab.evaluate("photos.forEach((photo) => { photo.outline = [[.1, .1], [.9, .1], [.9, .9]]; }); show();")
+        text = tab.evaluate("document.querySelector('textarea').value")
+    (capture / "masks.yaml").write_text(text, encoding="utf-8")
+    drawing, size = read_drawing(capture / "masks.yaml", None), np.array(SIZE)
+    assert set(drawing.marked) == {photo["name"] for photo in photos(capture / PAGE)}
+    assert any(name in drawing.cutouts for name in names)
+    for name, corners in before.panes["door"].items():
+        np.testing.assert_allclose(drawing.panes["door"][name] * size, corners, atol=0.01)
+    mine = drawing.cutouts["photos/a 6.jpg"]
+    np.testing.assert_allclose(np.reshape(mine.box, (2, 2)) * size, [[6, 4], [30, 36]], atol=0.01)
+    assert len(mine.inside) == 1
+    assert len(mine.outline) == 3
+
+
+def test_photos_in_a_folder_that_is_named_have_a_page(capture, tmp_path, monkeypatch):
+    bare = tmp_path / "bare"
+    shutil.copytree(capture / "photos", bare / "taken")
+    monkeypatch.setattr("pipelines.cli.outline._posed", lambda config, source: capture)
+    read, asked = registry.read_capture, []
+    monkeypatch.setattr(registry, "read_capture", lambda settings: asked.append(settings) or read(settings))
+    assert main(["outline", str(bare), "scene.images_dir=taken"]) == 0
+    assert [settings.images_dir for settings in asked] == [None]  # poses' folder has images/ only
+    assert len(photos(bare / PAGE)) == PHOTOS
+
+
+def test_the_run_that_follows_has_the_same_words():
+    assert _of_run(["a b", "sfm.seed=1"]) == ["a b", "sfm.seed=1", "method=rtgs", "preset=quick"]
+    assert _of_run(["a", "preset=smoke"]) == ["a", "preset=smoke", "method=rtgs"]
 
 
 def test_masks_that_the_capture_brings_need_none(capture, capsys):
