@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
+from rtgs.core.decisions import Decision
 from rtgs.core.refuse import refuse_bad_numbers, refuse_outside, refuse_unless
 from rtgs.methods.family import cubemap_stages, guided
 from rtgs.methods.scope import ScopeSettings
@@ -17,7 +18,6 @@ from rtgs.methods.spec import HARMONICS, MethodSpec
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from rtgs.core.decisions import Decision
     from rtgs.methods.model import Model
     from rtgs.methods.parts.base import BaseSet
     from rtgs.methods.spec import Setup
@@ -64,7 +64,7 @@ def build(setup: Setup) -> Model:
 
 
 def scope_terms(base: BaseSet, own: DeferredSettings, scene: Scene) -> Sequence[LossTerm | Decision]:
-    """The mean m of the Gaussians whose centres are outside of the scope, or why there is none."""
+    """The mean m of the Gaussians outside of the scope; where masks are to give it, what it is or why there is none."""
     from rtgs.methods.parts.cubemap_mirror import WEIGHT
     from rtgs.methods.scope import scope_of, why_no_scope
     from rtgs.train.terms import LossTerm
@@ -80,7 +80,8 @@ def scope_terms(base: BaseSet, own: DeferredSettings, scene: Scene) -> Sequence[
         far = ~scope.holds(gaussians.means.detach())
         return gaussians.activated(WEIGHT)[far].mean() if bool(far.any()) else None
 
-    return (LossTerm("outside", own.outside, outside),)
+    term = LossTerm("outside", own.outside, outside)
+    return (term, Decision(f"reflection in {scope}", "method.own.scope=masks")) if own.scope == "masks" else (term,)
 
 
 # Without MIRROR: what ablations take away there is the traced set.

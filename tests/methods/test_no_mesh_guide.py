@@ -111,3 +111,13 @@ def test_with_the_guide_a_view_without_a_mask_shows_the_silhouette():
     found = shown(model, made.scene.test[0])["transparent"]
     assert torch.equal(found, ObjectGuide(made.mesh).surfaces(made.scene.test[0].camera).hit)
     assert "no glass" not in str(model.decisions)
+
+
+@pytest.mark.parametrize("masks", ["given", "silhouette"])
+def test_where_the_mesh_says_it_all_the_same_that_is_said(masks: str):
+    settings = unguided("rtgs")
+    asked = replace(settings, transmittance=replace(settings.transmittance, test_masks=masks))
+    said = str(begun(asked, some_unmasked()).decisions)
+    assert "the object's mesh says where glass is" in said
+    assert f"test_masks={masks}" in said
+    assert "mesh says" not in str(begun(settings, some_unmasked()).decisions)

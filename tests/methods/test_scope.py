@@ -139,6 +139,7 @@ def test_3dgs_dr_pulls_down_what_the_masks_do_not_enclose():
     view, gaussians = made.scene.train[0], method["base"].gaussians
     far = ~scope.holds(gaussians.means.detach())
     assert 0 < int(far.sum()) < len(far)
+    assert f"reflection in {scope}" in [each.what for each in method.decisions]
     terms = method.losses(method.render(view.camera, 59, Mode.TRAIN), view, 59).terms
     (outside,) = [term for term in terms if term.name == "outside"]
     expected = gaussians[WEIGHT].detach()[far].sigmoid().mean()

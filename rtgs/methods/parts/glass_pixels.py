@@ -46,7 +46,10 @@ def shown_inside(settings: TransmittanceSettings, frame: Frame, hit: Tensor, cen
 
 
 def views_without_glass(settings: TransmittanceSettings, views: Sequence[View]) -> tuple[Decision, ...]:
-    """What is said of views that show no glass for want of a mask."""
+    """What is said of views that show no glass for want of a mask, and where the mesh says it all the same."""
+    if settings.second_bounce == "first_bounce" and not settings.masks_alone:
+        why = f"method.transmittance.test_masks={settings.test_masks}; as_trained knows nothing of it"
+        return (Decision("the object's mesh says where glass is", why),)
     bare = [view.name for view in views if bounding(view.mask) is None] if settings.masks_alone else []
     if not bare:
         return ()
