@@ -66,12 +66,12 @@ def build(setup: Setup) -> Model:
 def scope_terms(base: BaseSet, own: DeferredSettings, scene: Scene) -> Sequence[LossTerm | Decision]:
     """The mean m of the Gaussians outside of the scope; where masks are to give it, what it is or why there is none."""
     from rtgs.methods.parts.cubemap_mirror import WEIGHT
-    from rtgs.methods.scope import scope_of, why_no_scope
+    from rtgs.methods.scope import scope_of
     from rtgs.train.terms import LossTerm
 
-    scope = scope_of(own, scene) if own.outside > 0 else None
+    scope, said = scope_of(own, scene) if own.outside > 0 else (None, ())
     if scope is None:
-        return why_no_scope(own, scene) if own.outside > 0 else ()
+        return said
 
     def outside(rendered: object, view: object) -> Tensor | None:
         gaussians = base.set.gaussians
@@ -80,8 +80,7 @@ def scope_terms(base: BaseSet, own: DeferredSettings, scene: Scene) -> Sequence[
         far = ~scope.holds(gaussians.means.detach())
         return gaussians.activated(WEIGHT)[far].mean() if bool(far.any()) else None
 
-    term = LossTerm("outside", own.outside, outside)
-    return (term, Decision(f"reflection in {scope}", "method.own.scope=masks")) if own.scope == "masks" else (term,)
+    return (LossTerm("outside", own.outside, outside), *said)
 
 
 # Without MIRROR: what ablations take away there is the traced set.

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from rtgs.core.refuse import refuse_bad_counts, refuse_outside, refuse_unless
 from rtgs.methods.family import cubemap_stages, guided
-from rtgs.methods.scope import ScopeSettings, why_no_scope
+from rtgs.methods.scope import ScopeSettings
 from rtgs.methods.spec import HARMONICS, SURFACE, MethodSpec
 
 if TYPE_CHECKING:
@@ -70,7 +70,6 @@ def build(setup: Setup) -> Model:
     base = BaseSet(setup, SURFELS)
     mirror = FeatureMirror(setup, base, own)
     terms = (*surface_terms(setup), *mcmc_terms(base, setup), *feature_terms(base, own, setup))
-    terms = (*terms, *why_no_scope(own, setup.scene))
     return Model(setup, (base, mirror), terms)
 
 

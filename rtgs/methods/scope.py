@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -13,7 +13,6 @@ from rtgs.core.refuse import refuse_bad_point, refuse_outside, refuse_unknown_wo
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from rtgs.mesh.silhouettes import MaskView
     from rtgs.scenes.scene import Scene
 
 _STATE = "scope"  # (4,) float64 centre and radius
@@ -72,41 +71,23 @@ class Scope:
         return f"a sphere of {self.radius:.3g} around ({x:.3g}, {y:.3g}, {z:.3g})"
 
 
-def scope_of(settings: ScopeSettings, scene: Scene) -> Scope | None:
-    """The scope of a scene's training views; None: there is none.
+def scope_of(settings: ScopeSettings, scene: Scene) -> tuple[Scope | None, tuple[Decision, ...]]:
+    """The scope of a scene's training views, None: there is none; and what is said of it where masks were to give it.
 
     Raises:
         RtgsError: a mask does not fit its picture.
     """
     if settings.scope == "sphere":
-        return Scope(settings.scope_center, settings.scope_radius) if settings.scope_radius > 0 else None
-    return None if why_no_scope(settings, scene) else _around_masks(scene)
+        return Scope(settings.scope_center, settings.scope_radius) if settings.scope_radius > 0 else None, ()
+    from rtgs.mesh.silhouettes import crossing, enclosing_sphere, mask_set, why_unbounded
 
-
-def why_no_scope(settings: ScopeSettings, scene: Scene) -> tuple[Decision, ...]:
-    """What is said where masks were to give a scope and do not; empty: they do, or were not asked.
-
-    Raises:
-        RtgsError: a mask does not fit its picture.
-    """
-    from rtgs.mesh.silhouettes import crossing, why_unbounded
-
-    if settings.scope != "masks":
-        return ()
-    why = why_unbounded([view.mask for view in scene.train])
-    if not why and not crossing(_mask_views(scene)):
+    key, masks = "method.own.scope=masks", [view.mask for view in scene.train]
+    why = why_unbounded(masks)
+    if not why:
+        views = mask_set([view.camera for view in scene.train], masks).views
+        if crossing(views):
+            center, radius = enclosing_sphere(views)
+            found = Scope(tuple(center.tolist()), radius)
+            return found, (Decision(f"reflection in {found}", key),)
         why = "all masks are seen from one side: they do not say how far away the object is"
-    return (Decision("no scope, all may reflect", f"{why} (method.own.scope=masks)"),) if why else ()
-
-
-def _around_masks(scene: Scene) -> Scope:
-    from rtgs.mesh.silhouettes import enclosing_sphere
-
-    center, radius = enclosing_sphere(_mask_views(scene))
-    return Scope(tuple(center.tolist()), radius)
-
-
-def _mask_views(scene: Scene) -> Sequence[MaskView]:
-    from rtgs.mesh.silhouettes import mask_set
-
-    return mask_set([view.camera for view in scene.train], [view.mask for view in scene.train]).views
+    return None, (Decision("no scope, all may reflect", f"{why} ({key})"),)

@@ -66,9 +66,9 @@ def test_views_that_cut_the_object_count_only_where_all_do():
 
 def test_a_scene_without_masks_has_no_scope_and_a_typed_one_needs_none():
     made = tiny()
-    assert scope_of(ScopeSettings(scope="masks"), made.scene) is None
-    assert scope_of(ScopeSettings(), masked(made).scene) is None
-    typed = scope_of(ScopeSettings(scope_radius=0.5, scope_center=(1.0, 0.0, 0.0)), made.scene)
+    assert scope_of(ScopeSettings(scope="masks"), made.scene)[0] is None
+    assert scope_of(ScopeSettings(), masked(made).scene) == (None, ())
+    typed, _ = scope_of(ScopeSettings(scope_radius=0.5, scope_center=(1.0, 0.0, 0.0)), made.scene)
     assert typed is not None
     assert typed == Scope((1.0, 0.0, 0.0), 0.5)
     assert typed.holds(torch.tensor([[1.4, 0.0, 0.0], [0.4, 0.0, 0.0]])).tolist() == [True, False]
@@ -85,7 +85,7 @@ def test_masks_from_one_side_give_no_scope_and_that_is_said(name):
         (one_place, "seen from one side"),
         (made, "there are no masks"),
     ):
-        assert scope_of(ScopeSettings(scope="masks"), seen.scene) is None
+        assert scope_of(ScopeSettings(scope="masks"), seen.scene)[0] is None
         (said,) = (each for each in new_method(plain, seen, schedule()).decisions if "scope" in each.what)
         assert why in said.why
     assert "no scope" not in str(new_method(plain, masked(), schedule()).decisions)
@@ -134,7 +134,7 @@ def test_3dgs_dr_pulls_down_what_the_masks_do_not_enclose():
     made = masked()
     plain = replace(recipe("3dgs_dr"), loss=replace(recipe().loss, normal=0.0))
     method = train_all(replace(plain, own=MASKS), made, schedule(opacity_reset_every=0))
-    scope = scope_of(ScopeSettings(scope="masks"), made.scene)
+    scope, _ = scope_of(ScopeSettings(scope="masks"), made.scene)
     assert scope is not None
     view, gaussians = made.scene.train[0], method["base"].gaussians
     far = ~scope.holds(gaussians.means.detach())

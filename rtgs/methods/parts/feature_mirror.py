@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from rtgs.core.decisions import Decision
 from rtgs.gaussians.channels import Channel
 from rtgs.gaussians.surfels import ActivatedGaussians
 from rtgs.light.feature_network import SURFACE
@@ -54,7 +55,7 @@ class FeatureMirror(Part):
         self._stage = stage
         plan = reflection_plan(setup.settings.reflection, base.schedule)
         width = own.width or max(setup.settings.environment.side // 2, 8)
-        self.scope = scope_of(own, setup.scene)
+        self.scope, self._said = scope_of(own, setup.scene)
         self.learned = LearnedLight(setup, plan.start, own.network_rate, width)
 
     @property
@@ -82,9 +83,11 @@ class FeatureMirror(Part):
                 raw += noise * torch.randn(raw.shape, generator=self.generator)
         self.learned.begin()
         side, count = self.settings.environment.side, len(self.learned.groups[1])
-        where = "" if self.scope is None else f", in {self.scope}"
-        text = f"a map of {side} x {2 * side} features, a network of {count:,} numbers{where}"
-        yield StepEvent("begin", self.name, text)
+        yield StepEvent("begin", self.name, f"a map of {side} x {2 * side} features, a network of {count:,} numbers")
+
+    @property
+    def decisions(self) -> tuple[Decision, ...]:
+        return self._said
 
     @property
     def channels(self) -> tuple[Channel, ...]:
@@ -153,7 +156,9 @@ class FeatureMirror(Part):
     # ---- state
 
     def state(self) -> dict[str, Tensor]:
-        return self.scope.state() if self.learned.groups and self.scope is not None else {}
+        if self._own.scope != "masks" or self.scope is None or not self.learned.groups:
+            return {}
+        return self.scope.state()
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
         """The scope, the channels and the light as the state has them."""
