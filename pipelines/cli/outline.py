@@ -14,6 +14,7 @@ from rtgs.core.errors import RtgsError
 
 if TYPE_CHECKING:
     from rtgs.config.schema import RunConfig
+    from rtgs.prepare.masks.drawn import Drawing
     from rtgs.prepare.source import Source
 
 PAGE = "outline.html"
@@ -39,8 +40,7 @@ def outline(words: Sequence[str]) -> int:
     from pipelines.cli.app import short
     from pipelines.planning.inspection import Inspections
     from rtgs.config import compose
-    from rtgs.config.words import friendly_overrides
-    from rtgs.prepare.masks.drawn import read_drawing
+    from rtgs.config.words import friendly_overrides, is_override
     from rtgs.prepare.masks.outline_page import far_apart, write_outline_page
     from rtgs.prepare.poses.export import read_lenses
     from rtgs.prepare.source import mark_file
@@ -49,7 +49,7 @@ def outline(words: Sequence[str]) -> int:
 
     if words[0].startswith("-"):
         raise RtgsError(f"rtgs outline: {words[0]} is no word of it\n\n{HELP}")
-    first = words[0] if "=" in words[0] else f"scene.path={words[0]}"
+    first = words[0] if is_override(words[0]) else f"scene.path={words[0]}"
     config, _ = compose(friendly_overrides([first, *words[1:]]))
     inspection = Inspections().of(config.scene, config.sfm)
     if inspection.given_masks:
@@ -62,15 +62,29 @@ def outline(words: Sequence[str]) -> int:
     capture = read_capture(settings)
     views = select_views(capture, settings)
     target = mark_file(inspection.source, config.masks)
-    drawing = read_drawing(target, [view.name for view in views]) if target.is_file() else None
+    drawing = _earlier(target, [view.name for view in views])
     chosen = {views[row].name for row in far_apart([view.center for view in views], PHOTOS)}
     chosen |= set(drawing.marked) if drawing is not None else set()
     page = target.with_name(PAGE)
+    page.parent.mkdir(parents=True, exist_ok=True)
     shown = [view for view in views if view.name in chosen]
     write_outline_page(page, config.scene.name, shown, target, drawing, read_lenses(capture.root))
     print(f"{short(page)}: open it in a browser, outline the glass in three photos or more, save the file as")
     print(f"{short(target)}; then: rtgs run {shlex.join(_of_run(words))}")
     return 0
+
+
+def _earlier(file: Path, views: Sequence[str]) -> Drawing | None:
+    """The marks that the page begins with: those of the file, if it is there."""
+    from rtgs.prepare.errors import PrepareError
+    from rtgs.prepare.masks.drawn import read_drawing
+
+    if not file.is_file():
+        return None
+    try:
+        return read_drawing(file, views)
+    except PrepareError as error:
+        raise PrepareError(f"{error}\nmend that file, or remove it to begin anew") from error
 
 
 def _of_run(words: Sequence[str]) -> list[str]:

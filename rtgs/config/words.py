@@ -43,15 +43,15 @@ def friendly_overrides(arguments: Sequence[str]) -> list[str]:
     keys = {argument.partition("=")[0] for argument in rewritten}
     if "scene.path" in keys and "scene" not in keys:
         rewritten.append("scene=capture")
-    options = [argument for argument in rewritten if not _is_override(argument)]
-    return options + [argument for argument in rewritten if _is_override(argument)]  # argparse wants them in one piece
+    options = [argument for argument in rewritten if not is_override(argument)]
+    return options + [argument for argument in rewritten if is_override(argument)]  # argparse wants them in one piece
 
 
 def _with_keys(arguments: Sequence[str]) -> list[str]:
     """A word without a key that is a scene or a path becomes ``scene=``, unless an option before it wants it."""
     found: list[str] = []
     for before, argument in zip(("", *arguments), arguments):
-        alone = "=" not in argument and not argument.startswith(("-", "~")) and before not in _TAKE_A_VALUE
+        alone = not argument.startswith("-") and not is_override(argument) and before not in _TAKE_A_VALUE
         is_scene = alone and (argument in choices_of("scene") or _is_path(argument, ()))
         found.append(f"scene={argument}" if is_scene else argument)
     return found
@@ -77,8 +77,11 @@ def _is_path(text: str, arguments: Sequence[str]) -> bool:
     return Path(text).expanduser().exists() or (not own_files and (os.sep in text or text.startswith(("~", "."))))
 
 
-def _is_override(argument: str) -> bool:
-    return argument.startswith("~") or ("=" in argument and not argument.startswith("-"))
+def is_override(argument: str) -> bool:
+    """Whether a word is Hydra's, ``key=value`` or ``~key``: no option, and no path, in which "=" may stand as well."""
+    if argument.startswith(("-", os.sep, f".{os.sep}", f"..{os.sep}", f"~{os.sep}")):
+        return False
+    return argument.startswith("~") or "=" in argument
 
 
 def quoted(text: str) -> str:

@@ -27,6 +27,15 @@ def test_a_folder_or_a_scene_needs_no_key(folder, monkeypatch):
     assert friendly_overrides(["my photos"]) == ["scene=capture", "scene.path='my photos'"]
 
 
+def test_a_folder_may_have_an_equals_sign_in_its_name(tmp_path, monkeypatch):
+    (tmp_path / "seed=3").mkdir()
+    path = f"scene.path='{tmp_path / 'seed=3'}'"
+    assert friendly_overrides([str(tmp_path / "seed=3"), "seed=1"]) == ["scene=capture", path, "seed=1"]
+    monkeypatch.chdir(tmp_path)
+    assert friendly_overrides(["./seed=3"]) == ["scene=capture", "scene.path='./seed=3'"]
+    assert friendly_overrides(["seed=3"]) == ["seed=3"]  # the key
+
+
 def test_a_list_of_scenes_may_hold_folders(folder):
     words = friendly_overrides([f"scene=demo,{folder}", "method=2dgs,3dgs"])
     jobs, sweep = compose_jobs(words, multirun=True)

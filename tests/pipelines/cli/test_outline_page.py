@@ -81,6 +81,29 @@ def test_outlines_that_there_are_can_be_mended(capture):
     np.testing.assert_allclose(mine["outline"], [[0.1, 0.1], [0.5, 0.1], [0.5, 0.9]])
 
 
+@pytest.mark.parametrize("text", ["", "cutouts: [", "cutouts: {nobody.jpg: {outline: [[6, 4], [30, 4], [30, 36]]}}\n"])
+def test_a_file_of_marks_that_cannot_be_read_is_named(capture, text, capsys):
+    (capture / "masks.yaml").write_text(text)
+    assert main(["outline", str(capture)]) != 0
+    said = capsys.readouterr().err
+    assert "masks.yaml" in said
+    assert "remove it to begin anew" in said
+    assert not (capture / PAGE).exists()
+    assert (capture / "masks.yaml").read_text() == text
+
+
+def test_marks_may_lie_in_a_folder_that_is_not_there_yet(capture):
+    assert main(["outline", str(capture), "masks=polygon", "masks.drawn.file=marks/mine.yaml"]) == 0
+    assert len(photos(capture / "marks" / PAGE)) == PHOTOS
+
+
+def test_a_capture_may_have_an_equals_sign_in_its_name(capture):
+    other = capture.rename(capture.with_name("seed=3"))
+    assert main(["outline", str(other)]) == 0
+    assert (other / PAGE).is_file()
+    assert main(["check", str(other)]) == 0
+
+
 def test_marks_that_are_no_outlines_stay(capture):
     pane = "panes:\n  door:\n" + "".join(f"    a {k}.jpg: [[6, 4], [30, 4], [30, 36]]\n" for k in (3, 5))
     (capture / "masks.yaml").write_text(pane + "cutouts: {a 4.jpg: {box: [6, 4, 30, 36], inside: [[12, 8]]}}\n")
