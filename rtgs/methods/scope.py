@@ -30,8 +30,11 @@ class ScopeSettings:
         refuse_unknown_words(self, "method.own")
         refuse_outside(self, "method.own", 0, math.inf, "scope_radius")
         refuse_bad_point(self.scope_center, "method.own.scope_center")
-        given = self.scope_radius if self.scope == "masks" else 0
-        refuse_unless(given == 0, "method.own.scope_radius", given, "0 with method.own.scope=masks")
+        if self.scope == "masks":
+            beside = "with method.own.scope=masks, which finds the sphere"
+            refuse_unless(self.scope_radius == 0, "method.own.scope_radius", self.scope_radius, f"0 {beside}")
+            center = list(self.scope_center)
+            refuse_unless(not any(center), "method.own.scope_center", center, f"[0, 0, 0] {beside}")
 
     @property
     def scoped(self) -> bool:

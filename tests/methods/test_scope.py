@@ -96,6 +96,8 @@ def test_masks_and_a_typed_sphere_exclude_each_other(settings):
     assert not settings().scoped
     with pytest.raises(RtgsError, match=r"method\.own\.scope_radius.*scope=masks"):
         settings(scope="masks", scope_radius=0.5)
+    with pytest.raises(RtgsError, match=r"method\.own\.scope_center=\[0\.0, 0\.0, 0\.3\].*scope=masks"):
+        settings(scope="masks", scope_center=[0.0, 0.0, 0.3])
     with pytest.raises(RtgsError, match=r"method\.own\.scope"):
         settings(scope="auto")
 

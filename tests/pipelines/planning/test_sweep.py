@@ -161,7 +161,8 @@ def test_the_runs_of_a_sweep_are_seen_while_workers_are_at_it(capture, tmp_path,
     after = {run.info.run_id: run for run in _runs(tmp_path)}
     assert set(after) == {run.info.run_id for run in (group, *children)}  # none is recorded twice
     assert {run.info.status for run in after.values()} == {"FINISHED"}
-    assert all("eval/psnr" in after[run.info.run_id].data.metrics for run in children)
+    assert all({"eval/psnr", "eval/ssim", "eval/flip"} <= set(after[run.info.run_id].data.metrics) for run in children)
+    assert all(0 < after[run.info.run_id].data.metrics["eval/flip"] < 1 for run in children)
 
 
 def _runs(root: Path) -> list:
