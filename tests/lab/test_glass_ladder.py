@@ -13,12 +13,8 @@ import torch
 from lab import glass_ladder
 from lab.glass_ladder import (
     BRIGHT,
-    CHOICES,
     COLUMNS,
-    LADDER,
-    RUNGS,
     Measured,
-    Setting,
     base_config,
     bright_pixels,
     figures_of,
@@ -28,6 +24,7 @@ from lab.glass_ladder import (
     row,
     sized,
 )
+from lab.glass_rungs import CHOICES, LADDER, RUNGS, Setting
 from pipelines.planning.graph import build_graph
 from rtgs.config import compose
 from rtgs.methods.plans import propagation_due, reflection_plan
