@@ -7,10 +7,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from rtgs.core.recipe import UNLESS_DEFAULT
 from rtgs.core.refuse import refuse_bad_counts, refuse_outside, refuse_unless
 from rtgs.methods.family import cubemap_stages, guided
 from rtgs.methods.scope import ScopeSettings
@@ -36,7 +35,6 @@ class FeatureSettings(ScopeSettings):
 
     width: int = 0  # of the network's hidden layers; 0: half of environment.side, 256 of 512
     network_rate: float = 5e-4
-    network_rate_final: float = field(default=0.0, metadata=UNLESS_DEFAULT)  # exponential; 0: the rate stays
     albedo: float = -2.0  # log of five albedos at the start
     albedo_gain: float = 0.25  # of its rate, times that of sh_dc: 0.0005 of 0.002; other scenes 0.001
     # Standard deviation of the raw features at the start. 0 is published: their first gradient is then 1e12 times too
@@ -49,7 +47,7 @@ class FeatureSettings(ScopeSettings):
         refuse_bad_counts(self, "method.own")
         refuse_unless(self.width <= 1024, "method.own.width", self.width, "at most 1024")
         refuse_outside(self, "method.own", 0, math.inf, "network_rate", "albedo_gain", open_low=True)
-        refuse_outside(self, "method.own", 0, math.inf, "network_rate_final", "feature_noise", "opacity_entropy")
+        refuse_outside(self, "method.own", 0, math.inf, "feature_noise", "opacity_entropy")
         refuse_unless(-12 < self.albedo < 5, "method.own.albedo", self.albedo, "between -12 and 5")
 
 

@@ -318,7 +318,6 @@ def test_files_have_named_properties_and_the_light_a_picture(tmp_path):
         ({"width": -1}, r"method\.own\.width"),
         ({"feature_noise": -0.1}, r"method\.own\.feature_noise"),
         ({"network_rate": 0.0}, r"method\.own\.network_rate"),
-        ({"network_rate_final": -1.0}, r"method\.own\.network_rate_final"),
         ({"scope_center": [1.0]}, r"method\.own\.scope_center"),
         ({"sphere": 1.0}, r"method\.own\.sphere is no key"),
     ],
@@ -326,22 +325,6 @@ def test_files_have_named_properties_and_the_light_a_picture(tmp_path):
 def test_keys_that_make_no_sense_are_refused(own: dict, message: str):
     with pytest.raises((RtgsError, ValueError), match=message):
         create_method(settings(**own), small_scene(), schedule(), generator_for(0, "initialise"))
-
-
-def test_the_rates_of_map_and_network_fall_where_they_are_to():
-    def rates(chosen: MethodSettings) -> list[tuple[float, float]]:
-        plan = schedule()
-        method = create_method(chosen, small_scene(), plan, generator_for(0, "initialise"))
-        for stage in method.stages:
-            method.begin(stage)
-        groups = {group.name: group.rate for group in method.groups}
-        return [(groups[name].at(groups[name].start), groups[name].at(plan.total)) for name in ("environment", "network")]
-
-    steady = settings(network_rate=1e-3)
-    assert rates(steady) == [(pytest.approx(steady.environment.rate),) * 2, (pytest.approx(1e-3),) * 2]
-    falling = settings(network_rate=1e-3, network_rate_final=1e-5)
-    falling = replace(falling, environment=replace(falling.environment, rate_final=1e-4))
-    assert rates(falling) == [pytest.approx((steady.environment.rate, 1e-4)), pytest.approx((1e-3, 1e-5))]
 
 
 def test_a_map_without_mips_is_refused():

@@ -53,9 +53,8 @@ class FeatureLight:
 class LearnedLight:
     """Two parameter groups; there are none before :meth:`begin`."""
 
-    def __init__(self, setup: Setup, first: int, network_rate: tuple[float, float], width: int) -> None:
-        """``first``: the step at which it begins; ``network_rate``: then and at the end, 0: the same; ``width``: of
-        the hidden layers."""
+    def __init__(self, setup: Setup, first: int, network_rate: float, width: int) -> None:
+        """``first``: the step at which it begins; ``width``: of the hidden layers."""
         self.settings = setup.settings.environment
         self.groups: tuple[ParameterGroup, ...] = ()
         self.frame = torch.from_numpy(mean_frame(torch.stack([v.camera.rotation for v in setup.scene.train]))).float()
@@ -64,7 +63,7 @@ class LearnedLight:
         steps = max(setup.schedule.total - first, 1)
         self._rates = (
             Rate(self.settings.rate, self.settings.rate_final or None, steps, first),
-            Rate(network_rate[0], network_rate[1] or None, steps, first),
+            Rate(network_rate, start=first),
         )
 
     def begin(self) -> None:

@@ -56,7 +56,7 @@ class FeatureMirror(Part):
         plan = reflection_plan(setup.settings.reflection, base.schedule)
         width = own.width or max(setup.settings.environment.side // 2, 8)
         self.scope, self._said = scope_of(own, setup.scene)
-        self.learned = LearnedLight(setup, plan.start, (own.network_rate, own.network_rate_final), width)
+        self.learned = LearnedLight(setup, plan.start, own.network_rate, width)
 
     @property
     def groups(self) -> tuple[ParameterGroup, ...]:
