@@ -215,10 +215,10 @@ def check(words: list[str]) -> int:
         only = [name for word in words[1:] for name in word.removeprefix("scene=").split(",")]
         return check_dataset(words[0].removeprefix("data="), only)
     from rtgs.config import compose
-    from rtgs.config.words import friendly_overrides, is_override
+    from rtgs.config.words import friendly_overrides, is_override, quoted
     from rtgs.prepare.source import check_source
 
-    first = words[0] if is_override(words[0]) else f"scene.path={words[0]}"
+    first = words[0] if is_override(words[0]) else f"scene.path={quoted(words[0])}"
     config, _ = compose(friendly_overrides([first, *words[1:]]))
     findings = check_source(config.scene, config.sfm, config.masks)
     errors = sum(finding.severity == "error" for finding in findings)

@@ -40,7 +40,7 @@ def outline(words: Sequence[str]) -> int:
     from pipelines.cli.app import short
     from pipelines.planning.inspection import Inspections
     from rtgs.config import compose
-    from rtgs.config.words import friendly_overrides, is_override
+    from rtgs.config.words import friendly_overrides, is_override, quoted
     from rtgs.prepare.masks.outline_page import far_apart, write_outline_page
     from rtgs.prepare.poses.export import read_lenses
     from rtgs.prepare.source import mark_file
@@ -49,7 +49,7 @@ def outline(words: Sequence[str]) -> int:
 
     if words[0].startswith("-"):
         raise RtgsError(f"rtgs outline: {words[0]} is no word of it\n\n{HELP}")
-    first = words[0] if is_override(words[0]) else f"scene.path={words[0]}"
+    first = words[0] if is_override(words[0]) else f"scene.path={quoted(words[0])}"
     config, _ = compose(friendly_overrides([first, *words[1:]]))
     inspection = Inspections().of(config.scene, config.sfm)
     if inspection.given_masks:

@@ -237,4 +237,5 @@ def test_help_lists_groups_that_can_be_chosen(capsys):
     assert "\nablation: " in said
     assert "\npreset: " in said
     assert "after_preset" not in said
+    assert "method_in_preset" not in said
     assert "figure: " not in said

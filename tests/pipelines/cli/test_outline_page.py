@@ -104,6 +104,13 @@ def test_a_capture_may_have_an_equals_sign_in_its_name(capture):
     assert main(["check", str(other)]) == 0
 
 
+@pytest.mark.parametrize("command", ["check", "outline"])
+def test_a_capture_that_is_not_there_is_named_whatever_its_name(command, tmp_path, capsys):
+    assert main([command, str(tmp_path / "seed=3")]) == 1
+    said = capsys.readouterr()
+    assert f"{tmp_path / 'seed=3'} does not exist" in said.out + said.err
+
+
 def test_marks_that_are_no_outlines_stay(capture):
     pane = "panes:\n  door:\n" + "".join(f"    a {k}.jpg: [[6, 4], [30, 4], [30, 36]]\n" for k in (3, 5))
     (capture / "masks.yaml").write_text(pane + "cutouts: {a 4.jpg: {box: [6, 4, 30, 36], inside: [[12, 8]]}}\n")
