@@ -179,6 +179,11 @@ def _reflection(run: ShownRun) -> float | None:
     return sum(known) / len(known) if known else None
 
 
+def shipped(name: str) -> SceneDescription:
+    """The shipped scene that a run's is called after; a label behind the name (``spheres (stand-in)``) is ignored."""
+    return named_scene(name.split(" ")[0])
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.quality.environment",
@@ -195,7 +200,7 @@ def main() -> None:
     try:
         for name in options.runs:
             run = load(name)
-            scene = read_description(options.scene) if options.scene else named_scene(run.scene.name)
+            scene = read_description(options.scene) if options.scene else shipped(run.scene.name)
             truth = truth or truth_of(run, scene, options.samples, options.seed)
             one, picture = score(run, truth)
             scores.append(one)
@@ -206,7 +211,7 @@ def main() -> None:
                 f"{100 * one.seen:.0f} % of all directions; reflected layer {layer} dB",
                 flush=True,
             )
-    except RtgsError as error:
+    except (RtgsError, ValueError) as error:
         parser.error(str(error))
     assert truth is not None
     if options.png:

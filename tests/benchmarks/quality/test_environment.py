@@ -13,6 +13,7 @@ from benchmarks.quality.environment import (
     looked_up,
     mirrored,
     psnr,
+    shipped,
     solid_angles,
     with_gain,
 )
@@ -59,6 +60,12 @@ def test_the_largest_sharp_mirror_is_taken():
     assert spheres.shapes[largest_mirror(spheres)].name == "silver"
     with pytest.raises(RtgsError, match="no mirror ball"):
         largest_mirror(ball_scene(roughness=0.2))
+
+
+def test_a_run_of_a_table_has_its_scene_by_a_label():
+    assert shipped("spheres (stand-in)") == shipped("spheres") == named_scene("spheres")
+    with pytest.raises(ValueError, match="no synthetic scene 'far_balls'"):
+        shipped("far_balls")
 
 
 def test_a_ball_mirrors_what_is_behind_the_camera_in_its_middle():
