@@ -134,9 +134,9 @@ def ball_setting(options: argparse.Namespace) -> Setting:
     return Setting(options.scene, side, scene, judged, known, options.root)
 
 
-def held_out(scene: Scene) -> tuple[Scene, tuple[View, ...]]:
-    """The scene without its test views and without the views to judge, and these."""
-    judged = scene.train[HELD_OUT // 2 :: HELD_OUT]
+def held_out(scene: Scene, first: int = HELD_OUT // 2) -> tuple[Scene, tuple[View, ...]]:
+    """The scene without its test views and without the views to judge, every eighth from ``first`` on, and these."""
+    judged = scene.train[first::HELD_OUT]
     kept = tuple(view for view in scene.train if not any(view is other for other in judged))
     return replace(scene, train=kept, test=()), judged
 

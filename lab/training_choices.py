@@ -2,22 +2,25 @@
 
 ``python -m lab.training_choices --scenes toycar --methods 2dgs 3dgs --also "schedule.opacity_reset_every=2000"``
 
-Every eighth view of the training split is held out and judged; test views are never looked at. The first choice is the
-preset as it is, each ``--also`` one more. The third stage, which needs an object's mesh, is left out: of scenes with
-glass the first two are judged. Each run is a process of its own. A Markdown table grows on the screen, last line: a
-JSON object.
+Every eighth view of the training split is held out and judged, from the fourth on; these are few, so ``--folds 4 0``
+judges another eighth as well. Test views are never looked at. The first choice is the preset as it is, each ``--also``
+one more. The third stage, which needs an object's mesh, is left out: of scenes with glass the first two are judged.
+Each run is a process of its own. A Markdown table grows on the screen, last line: a JSON object.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import subprocess
 import sys
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 from benchmarks.common.machine import machine
+from lab.specular_choices import HELD_OUT
 
 if TYPE_CHECKING:
     from rtgs.scenes.scene import Scene
@@ -32,6 +35,7 @@ class Trial:
     preset: str
     words: str  # config words of the choice, "" is the preset as it is
     seed: int
+    fold: int = HELD_OUT // 2  # the first training view that is held out
 
 
 @dataclass(frozen=True)
@@ -41,6 +45,7 @@ class TrialScore:
     trial: Trial
     psnr: float
     ssim: float
+    masked: float | None  # PSNR in the masks; None: the scene has none
     gaussians: int
     cpu_seconds: float
     peak_mb: float
@@ -48,20 +53,21 @@ class TrialScore:
     def row(self) -> str:
         """A line of the table."""
         trial = self.trial
-        cells = (trial.scene, trial.method, trial.words or "as it is", str(trial.seed))
-        cells += (f"{self.psnr:.2f}", f"{self.ssim:.3f}", f"{self.gaussians:,}")
+        cells = (trial.scene, trial.method, trial.words or "as it is", str(trial.fold), str(trial.seed))
+        masked = "-" if self.masked is None else f"{self.masked:.2f}"
+        cells += (f"{self.psnr:.2f}", f"{self.ssim:.3f}", masked, f"{self.gaussians:,}")
         return f"| {' | '.join(cells)} | {self.cpu_seconds:.0f} | {self.peak_mb:.0f} |"
 
 
-def judged_in_training(scene: Scene) -> Scene:
-    """The scene with held-out training views in the place of its test views."""
+def judged_in_training(scene: Scene, first: int = HELD_OUT // 2) -> Scene:
+    """The scene with held-out training views in the place of its test views, every eighth from ``first`` on."""
     from lab.specular_choices import held_out
 
-    kept, judged = held_out(scene)
+    kept, judged = held_out(scene, first)
     return replace(kept, test=judged)
 
 
-HEADER = "| scene | method | choice | seed | PSNR | SSIM | Gaussians | CPU s | peak MB |"
+HEADER = "| scene | method | choice | fold | seed | PSNR | SSIM | in masks | Gaussians | CPU s | peak MB |"
 
 
 def measure(trial: Trial) -> TrialScore:
@@ -72,12 +78,13 @@ def measure(trial: Trial) -> TrialScore:
 
     torch.set_num_threads(1)
     words = [f"scene={trial.scene}", f"method={trial.method}", f"preset={trial.preset}", f"seed={trial.seed}"]
-    run = train_run([*words, *trial.words.split()], change=judged_in_training)
+    run = train_run([*words, *trial.words.split()], change=partial(judged_in_training, first=trial.fold))
     quality = run.quality()
     assert quality["psnr"] is not None
     assert quality["ssim"] is not None
     count = sum(len(part) for part in run.method.sets)
-    return TrialScore(trial, quality["psnr"], quality["ssim"], count, run.cpu_seconds, run.peak_memory_mb)
+    means = (quality["psnr"], quality["ssim"], quality["psnr_masked"])
+    return TrialScore(trial, *means, count, run.cpu_seconds, run.peak_memory_mb)
 
 
 def in_own_process(trial: Trial) -> TrialScore:
@@ -97,6 +104,7 @@ def main() -> None:
     add("--set", default="", metavar="WORDS", help="config words of every choice, in one string")
     add("--also", nargs="*", default=[], metavar="WORDS", help="more choices: config words in one string")
     add("--seeds", nargs="+", type=int, default=[0])
+    add("--folds", nargs="+", type=int, default=[HELD_OUT // 2], choices=range(HELD_OUT), help="first view held out")
     add("--one", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.one:
@@ -107,9 +115,9 @@ def main() -> None:
     for scene in options.scenes:
         for method in options.methods:
             for choice in ("", *options.also):
-                for seed in options.seeds:
-                    words = f"{options.set} {choice}".strip()
-                    scores.append(in_own_process(Trial(scene, method, options.preset, words, seed)))
+                words = f"{options.set} {choice}".strip()
+                for seed, fold in itertools.product(options.seeds, options.folds):
+                    scores.append(in_own_process(Trial(scene, method, options.preset, words, seed, fold)))
                     print(scores[-1].row(), flush=True)
     print(json.dumps({"machine": machine(), "scores": [asdict(score) for score in scores]}))
 

@@ -23,6 +23,8 @@ def test_training_choices_judges_without_test_views(run) -> None:
     assert other["trial"]["words"].endswith("method.loss.dssim=0")
     assert as_it_is["psnr"] != other["psnr"]
     assert 5 < as_it_is["psnr"] < 40
+    assert 5 < as_it_is["masked"] < 40
+    assert as_it_is["masked"] != as_it_is["psnr"]
     assert as_it_is["gaussians"] > 0
     assert as_it_is["cpu_seconds"] > 0
 
@@ -34,3 +36,6 @@ def test_training_choices_holds_out_training_views() -> None:
     assert judged
     assert not judged & trained
     assert judged | trained == {view.name for view in scene.train}
+    other = {view.name for view in training_choices.judged_in_training(scene, 0).test}
+    assert other
+    assert not other & judged, "another fold judges other views"
