@@ -15,10 +15,11 @@ from torch import Tensor
 
 from rtgs.core.cameras import mean_up
 from rtgs.core.errors import RtgsError
+from rtgs.core.files import whole_file
 from rtgs.light.cubemap import DirectionalLight
 from rtgs.optics.light import decoded
 
-PANORAMA, RADIANCE, CUBE = "environment.png", "environment.hdr", "environment_cube.npy"
+PANORAMA, RADIANCE, CUBE = "environment.png", "environment.exr", "environment_cube.npy"
 
 # Faces of OpenGL (its specification, table of cube map faces): middle, and where columns and rows grow to.
 _GL_FACES = (
@@ -90,22 +91,52 @@ def light_picture(light: DirectionalLight, directions: np.ndarray, roughness: fl
 def save_environment(folder: Path, light: DirectionalLight, frame: np.ndarray, side: int) -> tuple[Path, ...]:
     """Write a light whose colours are encoded as sRGB: as it is seen, and as linear light for programs that render.
 
-    Files: ``environment.png`` (panorama, 2 side high), ``environment.hdr`` (the same, linear, Radiance RGBE) and
-    ``environment_cube.npy`` (6, side, side, 3) float32, encoded, the faces of :func:`face_directions`.
+    Files, each as a whole or not at all: ``environment.png`` (panorama, 2 side high), ``environment.exr`` (the same,
+    linear, :func:`save_radiance`) and ``environment_cube.npy`` (6, side, side, 3) float32, encoded, the faces of
+    :func:`face_directions`.
 
     Raises:
-        RtgsError: a picture cannot be written.
+        RtgsError: the light is not finite.
+        OSError, RtgsError: a file cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
     panorama = light_picture(light, panorama_directions(2 * side, frame))
-    linear = decoded(torch.from_numpy(panorama), "linear").numpy()
-    bytes_ = np.round(255 * panorama.clip(0, 1)).astype(np.uint8)
     paths = tuple(folder / name for name in (PANORAMA, RADIANCE, CUBE))
-    for path, picture in zip(paths[:2], (bytes_, linear)):
-        if not cv2.imwrite(str(path), np.ascontiguousarray(picture[..., ::-1])):
-            raise RtgsError(f"{path}: the picture of the environment cannot be written; is there space left?")
-    np.save(paths[2], light_picture(light, face_directions(side, frame)))
+    save_radiance(paths[1], decoded(torch.from_numpy(panorama), "linear").numpy())
+    bytes_ = np.round(255 * panorama.clip(0, 1)).astype(np.uint8)
+    _, packed = cv2.imencode(".png", np.ascontiguousarray(bytes_[..., ::-1]))
+    with whole_file(paths[0]) as partial:
+        partial.write_bytes(packed.tobytes())
+    with whole_file(paths[2]) as partial, partial.open("wb") as stream:
+        np.save(stream, light_picture(light, face_directions(side, frame)))
     return paths
+
+
+def save_radiance(path: Path, linear: np.ndarray) -> None:
+    """Write a panorama (H, 2 H, 3) float32 of linear light, red, green, blue, as :func:`panorama_directions` has them.
+
+    OpenEXR, 32 bit, without loss, Rec. 709 primaries (what a file means that names none), marked as a map of longitude
+    and latitude. Seen from inside, as in OpenEXR's own layout, so renderers take it as it is.
+
+    Raises:
+        RtgsError: a value is NaN or infinite, or the file cannot be written.
+    """
+    import OpenEXR
+
+    if not np.isfinite(linear).all():
+        count = np.count_nonzero(~np.isfinite(linear).all(-1))
+        raise RtgsError(f"{path}: {count} pixels of the environment are NaN or infinite; nothing is written")
+    header = {
+        "type": OpenEXR.scanlineimage,
+        "compression": OpenEXR.ZIP_COMPRESSION,
+        "envmap": OpenEXR.ENVMAP_LATLONG,
+    }
+    with whole_file(path) as partial:
+        try:
+            with OpenEXR.File(header, {"RGB": np.ascontiguousarray(linear, dtype=np.float32)}) as file:
+                file.write(str(partial))
+        except RuntimeError as error:
+            raise RtgsError(f"{path}: the environment cannot be written; is there space left? {error}") from error
 
 
 def mean_frame(rotations: Tensor) -> np.ndarray:

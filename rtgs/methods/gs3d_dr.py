@@ -5,7 +5,6 @@ Its numbers are in conf/method/3dgs_dr.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
@@ -13,15 +12,16 @@ from rtgs.core.decisions import Decision
 from rtgs.core.refuse import refuse_bad_numbers, refuse_outside, refuse_unless
 from rtgs.methods.family import cubemap_stages, guided
 from rtgs.methods.scope import ScopeSettings
-from rtgs.methods.spec import HARMONICS, MethodSpec
+from rtgs.methods.spec import FAR_LIGHT, HARMONICS, PROPAGATION, SABOTAGE, MethodSpec
 
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from rtgs.gaussians.primitives import Gaussians
     from rtgs.methods.model import Model
     from rtgs.methods.parts.base import BaseSet
+    from rtgs.methods.parts.scope import ScopeHolder
     from rtgs.methods.spec import Setup
-    from rtgs.scenes.scene import Scene
     from rtgs.train.terms import LossTerm
 
 
@@ -32,6 +32,7 @@ class DeferredSettings(ScopeSettings):
     primitive: Literal["ellipsoids", "surfels"] = "ellipsoids"  # published: ellipsoids
     weight_floor: float = 0.001  # m is raised to it at resets of opacities
     outside: float = 0.4  # weight of the mean m of all Gaussians outside of the scope
+    scope_specular: float = 0.3  # of scope=specular: m from which on a pixel is specular
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -49,8 +50,9 @@ def build(setup: Setup) -> Model:
     from rtgs.methods.losses import mcmc_terms, refuse_surface_losses, surface_terms
     from rtgs.methods.model import Model
     from rtgs.methods.parts.base import BaseSet
-    from rtgs.methods.parts.cubemap_mirror import CubemapMirror
+    from rtgs.methods.parts.cubemap_mirror import WEIGHT, CubemapMirror
     from rtgs.methods.parts.kinds import ELLIPSOIDS, SURFELS
+    from rtgs.methods.parts.scope import ScopeHolder
 
     own: DeferredSettings = setup.own
     setup = replace(setup, settings=guided(setup.settings))
@@ -59,28 +61,36 @@ def build(setup: Setup) -> Model:
         refuse_surface_losses(setup.settings, ("normal", "distortion"))
     base = BaseSet(setup, SURFELS if surfels else ELLIPSOIDS)
     mirror = CubemapMirror(setup, base, own.weight_floor)
-    terms = (*surface_terms(setup), *mcmc_terms(base, setup), *scope_terms(base, own, setup.scene))
-    return Model(setup, (base, mirror), terms)
+    terms = (*surface_terms(setup), *mcmc_terms(base, setup))
+    if not own.scoped:
+        return Model(setup, (base, mirror), terms)
+    if own.outside == 0:
+        idle = Decision("no scope, all may reflect", "method.own.outside=0: there is no loss outside of it")
+        return Model(setup, (base, mirror), (*terms, idle))
+    held = ScopeHolder(setup, base, own, WEIGHT, weight_of)
+    return Model(setup, (base, held, mirror), (*terms, scope_term(base, own, held)))
 
 
-def scope_terms(base: BaseSet, own: DeferredSettings, scene: Scene) -> Sequence[LossTerm | Decision]:
-    """The mean m of the Gaussians outside of the scope; where masks are to give it, what it is or why there is none."""
+def weight_of(gaussians: Gaussians) -> Tensor:
+    """(N,) m: how specular Gaussians are."""
     from rtgs.methods.parts.cubemap_mirror import WEIGHT
-    from rtgs.methods.scope import scope_of
+
+    return gaussians.activated(WEIGHT)
+
+
+def scope_term(base: BaseSet, own: DeferredSettings, held: ScopeHolder) -> LossTerm:
+    """The mean m of the Gaussians outside of the scope, where there is one."""
+    from rtgs.methods.parts.cubemap_mirror import WEIGHT
     from rtgs.train.terms import LossTerm
 
-    scope, said = scope_of(own, scene) if own.outside > 0 else (None, ())
-    if scope is None:
-        return said
-
     def outside(rendered: object, view: object) -> Tensor | None:
-        gaussians = base.set.gaussians
-        if WEIGHT not in gaussians:
+        gaussians, scope = base.set.gaussians, held.scope
+        if scope is None or WEIGHT not in gaussians:
             return None
         far = ~scope.holds(gaussians.means.detach())
         return gaussians.activated(WEIGHT)[far].mean() if bool(far.any()) else None
 
-    return (LossTerm("outside", own.outside, outside), *said)
+    return LossTerm("outside", own.outside, outside)
 
 
 # Without MIRROR: what ablations take away there is the traced set.
@@ -88,6 +98,6 @@ SPEC = MethodSpec(
     "3dgs_dr",
     cubemap_stages("primitive"),
     build,
-    frozenset({HARMONICS}),
+    frozenset({HARMONICS, FAR_LIGHT, PROPAGATION, SABOTAGE}),
     own=DeferredSettings,
 )

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from rtgs.core.refuse import refuse_bad_counts, refuse_outside, refuse_unless
 from rtgs.methods.family import cubemap_stages, guided
 from rtgs.methods.scope import ScopeSettings
-from rtgs.methods.spec import HARMONICS, SURFACE, MethodSpec
+from rtgs.methods.spec import FAR_LIGHT, FEATURE_LIGHT, HARMONICS, SURFACE, MethodSpec
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -40,7 +40,9 @@ class FeatureSettings(ScopeSettings):
     # Standard deviation of the raw features at the start. 0 is published: their first gradient is then 1e12 times too
     # large, which Adam does not forget, and they stand still.
     feature_noise: float = 0.01
+    roughness_levels: bool = True  # False: what is rough mirrors the finest level of the map, too
     opacity_entropy: float = 1e-3  # weight
+    scope_specular: float = 0.65  # of scope=specular: 1 - r from which on a pixel is specular
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -60,21 +62,23 @@ def build(setup: Setup) -> Model:
     from rtgs.methods.losses import mcmc_terms, surface_terms
     from rtgs.methods.model import Model
     from rtgs.methods.parts.base import BaseSet
-    from rtgs.methods.parts.feature_mirror import FeatureMirror
+    from rtgs.methods.parts.feature_mirror import ALBEDO, FeatureMirror, smoothness
     from rtgs.methods.parts.kinds import SURFELS
+    from rtgs.methods.parts.scope import ScopeHolder
 
     own: FeatureSettings = setup.own
     side = setup.settings.environment.side
     refuse_unless(side >= 4 and side & (side - 1) == 0, "method.environment.side", side, "a power of 2, 4 or more")
     setup = replace(setup, settings=guided(setup.settings))
     base = BaseSet(setup, SURFELS)
-    mirror = FeatureMirror(setup, base, own)
+    held = ScopeHolder(setup, base, own, ALBEDO, smoothness)
+    mirror = FeatureMirror(setup, base, own, held)
     terms = (*surface_terms(setup), *mcmc_terms(base, setup), *feature_terms(base, own, setup))
-    return Model(setup, (base, mirror), terms)
+    return Model(setup, (base, held, mirror), terms)
 
 
 def feature_terms(base: BaseSet, own: FeatureSettings, setup: Setup) -> Sequence[LossTerm]:
-    """Opacities near 0 or 1, and where there is a scope the SH colours outside of it."""
+    """Opacities near 0 or 1, and where there is a scope the SH colours outside of it, all until it is found."""
     from rtgs.methods.parts.feature_mirror import OUTSIDE, SH_IMAGE
     from rtgs.methods.plans import reflection_plan
     from rtgs.train.coverage_losses import opacity_entropy
@@ -101,4 +105,5 @@ def feature_terms(base: BaseSet, own: FeatureSettings, setup: Setup) -> Sequence
     return [LossTerm(name, weight, value, start) for name, weight, value in terms if weight > 0]
 
 
-SPEC = MethodSpec("ref_gs", cubemap_stages(), build, frozenset({HARMONICS, SURFACE}), own=FeatureSettings)
+_HAS = frozenset({HARMONICS, SURFACE, FAR_LIGHT, FEATURE_LIGHT})
+SPEC = MethodSpec("ref_gs", cubemap_stages(), build, _HAS, own=FeatureSettings)

@@ -1,4 +1,5 @@
-"""Where a method may reflect: a sphere in the world, typed by hand as published, or around what the masks show."""
+"""Where a method may reflect: a sphere in the world, typed by hand as published, around what the masks show, or around
+the pixels that turn out specular in training."""
 
 from __future__ import annotations
 
@@ -9,11 +10,13 @@ from typing import TYPE_CHECKING, Literal
 
 from rtgs.core.decisions import Decision
 from rtgs.core.refuse import refuse_bad_point, refuse_outside, refuse_unknown_words, refuse_unless
+from rtgs.train.schedule import opacity_reset_due
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from rtgs.scenes.scene import Scene
+    from rtgs.train.settings import ScheduleSettings
 
 _STATE = "scope"  # (4,) float64 centre and radius
 
@@ -22,24 +25,45 @@ _STATE = "scope"  # (4,) float64 centre and radius
 class ScopeSettings:
     """Keys ``method.own.<name>`` of methods with a scope."""
 
-    scope: Literal["sphere", "masks"] = "sphere"  # masks: where the scene has none, there is no scope
+    # masks: around what they show, where the scene has none there is no scope; specular: around the pixels that turn
+    # out specular in training, none where they are too few
+    scope: Literal["sphere", "masks", "specular"] = "sphere"
     scope_radius: float = 0.0  # world units, of the sphere; 0: no scope
     scope_center: tuple[float, ...] = (0.0, 0.0, 0.0)  # world
+    # These of scope=specular alone. After this share of the second stage the training views are looked at, once; where
+    # opacities are reset, right before the next reset.
+    scope_at: float = 0.3
+    scope_specular: float = 0.3  # from this on a pixel is specular
+    scope_share: float = 0.002  # of the training views' pixels must be; that of method.reflection.matte
+    scope_margin: float = 1.1  # times the radius of what is found
 
     def __post_init__(self) -> None:
         refuse_unknown_words(self, "method.own")
         refuse_outside(self, "method.own", 0, math.inf, "scope_radius")
         refuse_bad_point(self.scope_center, "method.own.scope_center")
-        if self.scope == "masks":
-            beside = "with method.own.scope=masks, which finds the sphere"
+        refuse_outside(self, "method.own", 0, 1, "scope_at", "scope_specular", "scope_share", open_low=True)
+        refuse_outside(self, "method.own", 0, math.inf, "scope_margin", open_low=True)
+        if self.scope != "sphere":
+            beside = f"with method.own.scope={self.scope}, which finds the sphere"
             refuse_unless(self.scope_radius == 0, "method.own.scope_radius", self.scope_radius, f"0 {beside}")
             center = list(self.scope_center)
             refuse_unless(not any(center), "method.own.scope_center", center, f"[0, 0, 0] {beside}")
 
     @property
     def scoped(self) -> bool:
-        """There may be a scope: masks are looked for when the model is made."""
-        return self.scope == "masks" or self.scope_radius > 0
+        """There may be a scope: masks are looked for when the model is made, specular pixels in training."""
+        return self.scope != "sphere" or self.scope_radius > 0
+
+    def looked_at(self, start: int, schedule: ScheduleSettings) -> int:
+        """The step before which specular pixels are looked for, of a second stage from ``start`` on.
+
+        From the end of the run on: never, the stage is too short.
+        """
+        step = start + max(1, round(self.scope_at * (schedule.total - start)))
+        every = schedule.opacity_reset_every
+        following = -(-step // every) * every if every > 0 else step
+        # What is seen right after a reset is transparent; that of this very step has not happened yet.
+        return following if opacity_reset_due(schedule, following) else min(step, max(schedule.total - 1, start + 1))
 
 
 @dataclass(frozen=True)
@@ -56,7 +80,8 @@ class Scope:
         return in_sphere(points, self.center, self.radius)
 
     def state(self) -> dict[str, Tensor]:
-        """For a checkpoint: pictures are made from other views than were trained on, whose masks are others."""
+        """For a checkpoint: pictures are made from other views than were trained on, whose masks are others, and what
+        turned out specular is looked for once."""
         import torch
 
         return {_STATE: torch.tensor([*self.center, self.radius], dtype=torch.float64)}
@@ -75,12 +100,13 @@ class Scope:
 
 
 def scope_of(settings: ScopeSettings, scene: Scene) -> tuple[Scope | None, tuple[Decision, ...]]:
-    """The scope of a scene's training views, None: there is none; and what is said of it where masks were to give it.
+    """The scope of a scene's training views, None: there is none, or none yet where specular pixels are to give it; and
+    what is said of it where masks were to give it.
 
     Raises:
         RtgsError: a mask does not fit its picture.
     """
-    if settings.scope == "sphere":
+    if settings.scope != "masks":
         return Scope(settings.scope_center, settings.scope_radius) if settings.scope_radius > 0 else None, ()
     from rtgs.mesh.silhouettes import crossing, enclosing_sphere, mask_set, why_unbounded
 

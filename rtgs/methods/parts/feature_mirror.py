@@ -13,15 +13,16 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from rtgs.core.decisions import Decision
 from rtgs.gaussians.channels import Channel
+from rtgs.gaussians.primitives import Gaussians
 from rtgs.gaussians.surfels import ActivatedGaussians
 from rtgs.light.feature_network import SURFACE
 from rtgs.methods.parts.base import BaseSet, composited
 from rtgs.methods.parts.feature_light import FeatureLight, LearnedLight
 from rtgs.methods.parts.part import Frame, Part, Raster
+from rtgs.methods.parts.scope import ScopeHolder
 from rtgs.methods.plans import reflection_plan
-from rtgs.methods.scope import Scope, scope_of
+from rtgs.methods.scope import Scope
 from rtgs.methods.shading.deferred import mirror_directions
 from rtgs.optics.light import encoded
 from rtgs.train.method import RenderedView, RenderOptions, Stage, StepEvent
@@ -39,23 +40,22 @@ SH_IMAGE, OUTSIDE = "sh_image", "outside"  # maps: the image of the SH colours, 
 
 
 class FeatureMirror(Part):
-    """Albedo, roughness and features on the base set, and the light that they mirror, from their stage on.
-
-    Attributes:
-        scope: what reflects; None: everything.
-    """
+    """Albedo, roughness and features on the base set, and the light that they mirror, from their stage on."""
 
     name = "mirror"
 
-    def __init__(self, setup: Setup, base: BaseSet, own: FeatureSettings, stage: str = "reflection") -> None:
+    def __init__(
+        self, setup: Setup, base: BaseSet, own: FeatureSettings, held: ScopeHolder, stage: str = "reflection"
+    ) -> None:
+        """``held``: what reflects."""
         self.base = base
+        self.held = held
         self.settings = setup.settings
         self.generator = setup.generator
         self._own = own
         self._stage = stage
         plan = reflection_plan(setup.settings.reflection, base.schedule)
         width = own.width or max(setup.settings.environment.side // 2, 8)
-        self.scope, self._said = scope_of(own, setup.scene)
         self.learned = LearnedLight(setup, plan.start, own.network_rate, width)
 
     @property
@@ -86,8 +86,9 @@ class FeatureMirror(Part):
         yield StepEvent("begin", self.name, f"a map of {side} x {2 * side} features, a network of {count:,} numbers")
 
     @property
-    def decisions(self) -> tuple[Decision, ...]:
-        return self._said
+    def scope(self) -> Scope | None:
+        """What reflects at present; None: everything."""
+        return self.held.scope
 
     @property
     def channels(self) -> tuple[Channel, ...]:
@@ -106,7 +107,7 @@ class FeatureMirror(Part):
     def _adopt(self) -> None:
         if ALBEDO not in self.base.set.gaussians:
             self.base.set.adopt(self.base.set.gaussians.with_channels(*self.channels))
-        self.base.painter = None if self.scope is None else self
+        self.base.painter = self
 
     # ---- rendering
 
@@ -114,10 +115,11 @@ class FeatureMirror(Part):
         return RenderOptions(normal=bool(self.learned.groups))
 
     def paint(self, frame: Frame, rows: ActivatedGaussians) -> Tensor:
-        """(N, 12) SH colour, channels, and whether the centre is inside of the scope."""
-        assert self.scope is not None
-        inside = self.scope.holds(rows.means.detach())
-        return torch.cat((composited(self.base.set.gaussians, rows.colors), inside[:, None].float()), dim=1)
+        """(N, 11 or 12) SH colour, channels, and where there is a scope whether the centre is inside of it."""
+        features = composited(self.base.set.gaussians, rows.colors)
+        if self.scope is None:
+            return features
+        return torch.cat((features, self.scope.holds(rows.means.detach())[:, None].float()), dim=1)
 
     def shade(self, frame: Frame, raster: Raster) -> RenderedView | None:
         """Every pixel of the inside looks up what its mean normal mirrors."""
@@ -127,7 +129,7 @@ class FeatureMirror(Part):
         camera, buffers = frame.camera, raster.buffers
         assert buffers.normal is not None
         flat, alpha = buffers.features.flatten(1), buffers.alpha.flatten()
-        scoped = self.scope is not None
+        scoped, pending = self.scope is not None, self.held.pending
         # Both weights are constants, as published. Without a scope the coverage must learn from the image.
         inside = flat[11].detach() if scoped else alpha
         outside = (alpha.detach() - inside).clamp_min(0) if scoped else torch.zeros_like(alpha.detach())
@@ -135,16 +137,19 @@ class FeatureMirror(Part):
         normal, view = buffers.normal.flatten(1)[:, chosen], frame.rays.directions[:, chosen]
         rays = mirror_directions(normal, frame.rays.center, view)
         albedo, roughness, feature = flat[3:6, chosen], flat[6, chosen], flat[7:11, chosen]
-        found = light.linear(rays.directions, roughness, feature.T).T
+        level = roughness if self._own.roughness_levels else torch.zeros_like(roughness)
+        found = light.linear(rays.directions, level, feature.T).T
         shape = (3, camera.height, camera.width)
         shown = torch.zeros_like(flat[:3]).index_copy(1, chosen, encoded(albedo + found, "linear"))
-        colors = flat[:3] if scoped else flat[:3].detach()
+        colors = flat[:3] if scoped or pending else flat[:3].detach()
         background = torch.tensor(self.settings.render.background)[:, None]
         clear = (1 - alpha) * background  # in ``colors`` already, and seen beside both shares
         kept = colors - clear.detach() if bool(background.any()) else colors
         image = inside * shown + outside * kept
         image = (image + clear if bool(background.any()) else image).reshape(shape)
         maps = {SH_IMAGE: colors.reshape(shape), OUTSIDE: outside.reshape(shape[1:])} if scoped else {}
+        if pending:  # any pixel may be outside once the scope is known: SH colours learn everywhere until then
+            maps = {SH_IMAGE: colors.reshape(shape), OUTSIDE: alpha.detach().reshape(shape[1:])}
         layers = None
         if frame.options.layers:
             layers = _layers(shape, inside.detach(), (outside * kept).detach(), chosen, albedo.detach(), found.detach())
@@ -155,22 +160,20 @@ class FeatureMirror(Part):
 
     # ---- state
 
-    def state(self) -> dict[str, Tensor]:
-        if self._own.scope != "masks" or self.scope is None or not self.learned.groups:
-            return {}
-        return self.scope.state()
-
     def restore(self, state: Mapping[str, Tensor]) -> None:
-        """The scope, the channels and the light as the state has them."""
+        """The channels and the light as the state has them."""
         gaussians, there = self.base.set.gaussians, f"{self.base.name}.surfels.{ALBEDO}" in state
         if there:
-            if self._own.scope == "masks":
-                self.scope = Scope.of(state)
             self._adopt()
-        elif not there and ALBEDO in gaussians:
+        elif ALBEDO in gaussians:
             self.base.set.adopt(gaussians.without_channels(ALBEDO, ROUGHNESS, FEATURE))
             self.base.painter = None
         self.learned.restore(state)
+
+
+def smoothness(gaussians: Gaussians) -> Tensor:
+    """(N,) 1 - r: how specular Gaussians are."""
+    return 1 - gaussians.activated(ROUGHNESS)
 
 
 def _layers(
