@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,7 +14,7 @@ from rtgs.config.explain import close_keys
 from rtgs.config.keys import Key, config_keys, own_keys, sentence_of, words_of_value
 from rtgs.config.locate import project_root
 from rtgs.config.opened import OPTIONS, friendly_words, split_config_dir, with_configs
-from rtgs.config.provenance import Setting, settings_of
+from rtgs.config.provenance import settings_of
 from rtgs.core.credentials import redact
 from rtgs.core.errors import RtgsError
 from rtgs.core.listing import columns
@@ -26,6 +27,7 @@ HELP = """rtgs explain [KEY ...] [--config-dir FOLDER] [words of a run]
   rtgs explain method.loss                    every key below it, with its value
   rtgs explain                                all keys"""
 _WIDTH = 100
+_NOWHERE = "nowhere: the default"
 
 
 def explain(words: Sequence[str]) -> int:
@@ -64,11 +66,7 @@ def _own(config: RunConfig) -> Any:
 def one_key(key: Key, config: RunConfig, words: Sequence[str]) -> str:
     """All that is known of a key in the run of these words."""
     rows = [("value", redact(str(value_of(config, key.name))))]
-    settings = settings_of(key.name, words)
-    if settings:
-        rows.append(("set in", settings[-1].place if len(settings) == 1 else _chain(settings)))
-    else:
-        rows.append(("set in", "nowhere: the default"))
+    rows.append(("set in", _set_in(key.name, words)))
     source = Path(inspect.getfile(key.owner)).resolve()
     if source.is_relative_to(project_root()):  # not of a method from outside
         source = source.relative_to(project_root())
@@ -82,10 +80,20 @@ def one_key(key: Key, config: RunConfig, words: Sequence[str]) -> str:
     return "\n".join(lines)
 
 
-def _chain(settings: Sequence[Setting]) -> str:
-    """The last place, and what it went over."""
+def _set_in(name: str, words: Sequence[str]) -> str:
+    """The last place that sets a key, and what it went over; where that place takes another key's value, also those of
+    the other key."""
+    settings = settings_of(name, words)
+    if not settings:
+        return _NOWHERE
     *before, last = settings
-    return f"{last.place} (before it {', '.join(f'{each.place}: {redact(each.text)}' for each in reversed(before))})"
+    over = ", ".join(f"{each.place}: {redact(each.text)}" for each in reversed(before))
+    place = f"{last.place} (before it {over})" if over else last.place
+    other = re.fullmatch(r"\$\{([a-z_0-9.]+)\}", last.text)
+    if other is None:
+        return place
+    where = _set_in(other[1], words)
+    return f"{place}, which takes {other[1]}, set {where if where == _NOWHERE else f'in {where}'}"
 
 
 def _listed(name: str, config: RunConfig) -> str:

@@ -45,7 +45,7 @@ from rtgs.workflow import Plan, SweepOutcomes
 log = logging.getLogger("rtgs")
 TOPLEVEL_PLUGINS = "hydra_plugins"  # where Hydra wants them
 _JOB_NAME = "app"  # of the log file in a run's output folder
-_NOT_CHOSEN = ("after_preset: ", "method_in_preset: ", "figure: ")  # folders of conf/ that are no groups of a run
+_NOT_CHOSEN = ("after_preset: ", "method_in_preset: ", "method_on_scene", "figure: ")  # of conf/: no groups of a run
 
 
 class HydraApp:

@@ -68,8 +68,9 @@ def _printed(config: RunConfig, row: str) -> RunConfig:
     method, _, ablation = row.partition(", ")
     words = [f"method={PRINTED.get(method, method)}", "preset=paper", f"scene={_scene_file(config.scene.name)}"]
     if ablation:
-        needs = load_yaml(conf_dir() / "ablation" / f"{ablation}.yaml")["ablation"].get("needs", ())
-        words += [f"ablation={ablation}"] if set(needs) <= find_method(PRINTED.get(method, method)).has else []
+        about = load_yaml(conf_dir() / "ablation" / f"{ablation}.yaml")["ablation"]
+        has = set(about.get("needs", ())) <= find_method(PRINTED.get(method, method)).has
+        words += [f"ablation={ablation}"] if has and "paper" not in about.get("idle_with", ()) else []
     return compose([*words, f"seed={config.seed}"])[0]
 
 
@@ -82,8 +83,12 @@ def _scene_file(name: str) -> str:
 
 
 def _values(config: RunConfig) -> dict[str, object]:
-    """What the method reads of the config, by dotted key."""
-    values = flatten(asdict(replace(config, method=_read(config.method))))
+    """What the method reads of the config, by dotted key; of its own settings also those that are defaults."""
+    read = _read(config.method)
+    own = find_method(read.name).own_settings(read)
+    values = flatten(asdict(replace(config, method=read)))
+    if own is not None:
+        values |= {f"method.own.{key}": value for key, value in flatten(asdict(own)).items()}
     adaptive = config.method.density.strategy == "adaptive"
     outside = (*_OUTSIDE, "method.density.mcmc.") if adaptive else _OUTSIDE
     return {key: value for key, value in values.items() if not key.startswith(outside)}

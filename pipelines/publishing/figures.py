@@ -24,6 +24,7 @@ from rtgs.workflow import Store
 
 if TYPE_CHECKING:
     import numpy as np
+    from torch import Tensor
 
     from rtgs.evaluate.records import EvaluationTable
     from rtgs.report.panels import PanelRow, Tile
@@ -43,6 +44,8 @@ class FigureRow:
     """A test view. Empty: the first."""
     crops: tuple[tuple[float, ...], ...] = ()
     """Magnified parts: x, y, width, height in shares of the picture."""
+    words: tuple[str, ...] = ()
+    """Of the runs of all its columns, before theirs; for rows that show several methods on one scene."""
 
 
 @dataclass(frozen=True)
@@ -51,9 +54,10 @@ class FigureColumn:
 
     title: str
     layer: str = "image"
-    """One of :data:`rtgs.report.panels.LAYERS`. ``photo`` needs no words."""
+    """One of :data:`rtgs.report.panels.LAYERS`."""
     words: tuple[str, ...] = ()
-    """The run, as for ``rtgs run`` without scene and preset."""
+    """The run, as for ``rtgs run`` without scene and preset. Empty: that of the row, else of the first column that has
+    words; ``photo`` needs none."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +82,8 @@ def read_figure(path: Path) -> FigureSpec:
     except RtgsError as error:
         raise RtgsError(f"figure {path} is no YAML ({error}): {REMEDY}") from error
     spec = record_of(FigureSpec, values if isinstance(values, dict) else {}, path, REMEDY)
-    if not spec.rows or not any(column.words for column in spec.columns):
+    named = spec.columns and all(row.words for row in spec.rows)
+    if not spec.rows or not (named or any(column.words for column in spec.columns)):
         raise RtgsError(f"figure {path} has no rows, or no column with the words of a run: {REMEDY}")
     return spec
 
@@ -129,10 +134,30 @@ class CachedRun:
 
     def pixels(self, view: View, layer: str) -> np.ndarray | None:
         """One layer of a test view; None: the method has none."""
-        from rtgs.report.panels import PHOTO, layer_pixels
+        from rtgs.report.panels import ENVIRONMENT, PHOTO, layer_pixels
 
-        maps = {} if layer == PHOTO else read_render(self._folder("render"), view.name)
+        if layer == ENVIRONMENT:
+            maps = self._panorama()
+        else:
+            maps = {} if layer == PHOTO else read_render(self._folder("render"), view.name)
         return layer_pixels(layer, maps, view.image, view.camera, self.config.method.optics.blend)
+
+    def _panorama(self) -> dict[str, Tensor]:
+        """``environment`` (3, h, w) of a method with a far light, else nothing."""
+        import numpy as np
+        import torch
+        from PIL import Image
+
+        from pipelines.steps.render import ENVIRONMENT as FOLDER
+        from rtgs.light.pictures import PANORAMA
+        from rtgs.report.panels import ENVIRONMENT
+
+        path = self._folder("render") / FOLDER / PANORAMA
+        if not path.is_file():
+            return {}
+        with Image.open(path) as picture:
+            pixels = torch.from_numpy(np.array(picture.convert("RGB")))
+        return {ENVIRONMENT: pixels.permute(2, 0, 1) / 255}
 
     def _folder(self, step: str) -> Path:
         artifact = self.store.find(getattr(self.graph, step))
@@ -150,7 +175,7 @@ class Runs:
 
     def of(self, row: FigureRow, column: FigureColumn) -> CachedRun:
         """The run of a column on a row's scene."""
-        words = tuple(friendly_overrides((f"scene={row.scene}", *column.words, *self._words)))
+        words = tuple(friendly_overrides((f"scene={row.scene}", *row.words, *column.words, *self._words)))
         if words not in self._known:
             config, choices = compose(words)
             graph = build_graph(config, choices, self._inspections)
@@ -166,8 +191,8 @@ def draw_figure(name: str, spec: FigureSpec, runs: Runs) -> tuple[Path, ...]:
     """
     from rtgs.report.panels import draw_panels
 
-    first = next(column for column in spec.columns if column.words)
-    needed = [runs.of(row, column) for row in spec.rows for column in spec.columns if column.words]
+    first = next((column for column in spec.columns if column.words), spec.columns[0])
+    needed = [runs.of(row, column) for row in spec.rows for column in spec.columns if row.words or column.words]
     if missing := dict.fromkeys(run.command for run in needed if run.missing):
         total = len({run.command for run in needed})
         raise RtgsError(
@@ -191,14 +216,15 @@ def _row(row: FigureRow, spec: FigureSpec, runs: Runs, first: FigureColumn) -> t
     view = _view(row, runs.of(row, first).scene)
     tiles, told = [], []
     for column in spec.columns:
-        run = runs.of(row, column if column.words else first)
+        run = runs.of(row, column if row.words or column.words else first)
         tiles.append(_tile(column, run, view))
         if column.layer == "image":
             told.append(f"{run.label} {run.psnr(view.name):.2f} dB")
     if wrong := [crop for crop in row.crops if len(crop) != 4]:
         raise RtgsError(f"crops of {row.scene}: {list(wrong[0])} must be x, y, width, height: {REMEDY}")
-    label = f"{runs.of(row, first).scores.facts.scene}\n{view.name}"
-    text = f"{label.replace(chr(10), ', ')}: {', '.join(dict.fromkeys(told))}."
+    scene = f"{runs.of(row, first).scores.facts.scene}\n{view.name}"
+    text = f"{scene.replace(chr(10), ', ')}: {', '.join(dict.fromkeys(told))}."
+    label = f"{runs.of(row, first).label}\n{scene}" if row.words else scene
     return PanelRow(label, tuple(tiles), tuple(Box(*crop) for crop in row.crops)), text
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from rtgs.config.locate import choices_of
 from rtgs.config.names import derive_name, run_name
 from rtgs.config.schema import Choices, RunConfig
 from rtgs.config.words import FOLDER_CHOICE, quoted
@@ -34,7 +35,7 @@ def to_run_config(composed: DictConfig, choices: Choices) -> tuple[RunConfig, Ch
 
     Raises:
         RtgsError: a mandatory value is missing or an interpolation fails (names the key); the ablation is not for the
-            method.
+            method, or not for the preset.
     """
     hide_credentials(composed)
     try:
@@ -101,10 +102,10 @@ def with_own(method: MethodSettings) -> MethodSettings:
 
 
 def _refuse_idle_ablation(config: RunConfig, choices: Choices) -> None:
-    """An ablation is for methods that have what it takes away.
+    """An ablation is for methods that have what it takes away, with presets that have it on.
 
     Raises:
-        RtgsError: the method has not.
+        RtgsError: the method has not, or it is off.
     """
     needs = set(config.ablation.needs)
     if unknown := sorted(needs - set(FEATURES)):
@@ -118,6 +119,12 @@ def _refuse_idle_ablation(config: RunConfig, choices: Choices) -> None:
         raise RtgsError(
             f"config: ablation={choices.ablation} takes nothing away from method {config.method.name}, which has no "
             f"{', '.join(lacking)}: it is for {fit}"
+        )
+    if choices.preset in config.ablation.idle_with:
+        fit = ", ".join(name for name in choices_of("preset") if name not in config.ablation.idle_with)
+        raise RtgsError(
+            f"config: ablation={choices.ablation} takes nothing away from method {config.method.name} with "
+            f"preset={choices.preset}, where it is off already: it is for preset {fit}"
         )
 
 

@@ -82,6 +82,8 @@ class AblationConfig:
     """One line: what the flipped keys take away and what should be seen."""
     needs: tuple[str, ...] = ()
     """What a method must have for it (:data:`rtgs.methods.spec.FEATURES`); others are refused. Empty: nothing."""
+    idle_with: tuple[str, ...] = ()
+    """Presets in which what it takes away is off already: it is refused with them."""
 
 
 @dataclass(frozen=True)

@@ -159,7 +159,7 @@ class DensitySettings:
 class MaterialSettings:
     """What each surfel of the base set says about its surface (method.md 2, 3.3, 4.2, 4.4)."""
 
-    specular: float = 1e-3  # initial k_s: EnvGS 1e-3 (decision 28: for all scenes); 0.1 for gardenspheres
+    specular: float = 1e-3  # initial k_s: EnvGS 1e-3, on gardenspheres 0.1 (decision 28)
     # Initial roughness and reflectance at normal incidence, decision 6. With S_max 1 the weight w_r starts at 0.85
     # and stays there to grazing, close to EnvGS's 1. With method.md 4.4's 0.005 and 0.04 it starts at 0.2: a mirror
     # ray is darker than what it replaces, and k_s falls before the reflection set has learned (docs/lab/reflection.md).

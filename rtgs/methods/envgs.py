@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from rtgs.methods.family import DIFFUSE, REFLECTION
-from rtgs.methods.spec import HARMONICS, MIRROR, SURFACE, MethodSpec
+from rtgs.methods.spec import HARMONICS, MIRROR, PROPAGATION, SABOTAGE, SURFACE, MethodSpec
 
 if TYPE_CHECKING:
     from rtgs.methods.model import Model
@@ -29,4 +29,5 @@ def build(setup: Setup) -> Model:
     return Model(setup, (base, mirror), terms)
 
 
-SPEC = MethodSpec("envgs", (DIFFUSE, REFLECTION), build, frozenset({HARMONICS, SURFACE, MIRROR}))
+_HAS = frozenset({HARMONICS, SURFACE, MIRROR, PROPAGATION, SABOTAGE})
+SPEC = MethodSpec("envgs", (DIFFUSE, REFLECTION), build, _HAS)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from rtgs.core.refuse import refuse_bad_numbers, refuse_outside, refuse_unless
 from rtgs.methods.family import guided
 from rtgs.methods.reads import diffuse_alone
-from rtgs.methods.spec import MethodSpec, StageSpec
+from rtgs.methods.spec import FAR_LIGHT, FORWARD, MethodSpec, StageSpec
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -123,4 +123,5 @@ def _shaded(settings: MethodSettings) -> MethodSettings:
     return replace(plain, environment=settings.environment, optimizer=replace(plain.optimizer, **rates))
 
 
-SPEC = MethodSpec("gaussian_shader", (StageSpec(STAGE, reads=_shaded),), build, own=ShaderSettings)
+_HAS = frozenset({FAR_LIGHT, FORWARD})
+SPEC = MethodSpec("gaussian_shader", (StageSpec(STAGE, reads=_shaded),), build, _HAS, own=ShaderSettings)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal
 from rtgs.core.errors import RtgsError
 from rtgs.core.refuse import refuse_bad_counts, refuse_bad_numbers, refuse_outside, refuse_unknown_words, refuse_unless
 from rtgs.methods.family import cubemap_stages, guided
-from rtgs.methods.spec import HARMONICS, SURFACE, MethodSpec
+from rtgs.methods.spec import FAR_LIGHT, HARMONICS, METAL, PROPAGATION, SURFACE, MethodSpec
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -117,6 +117,6 @@ SPEC = MethodSpec(
     "ref_gaussian",
     (_DIFFUSE, replace(_LIT, start=_reflection_start)),
     build,
-    has=frozenset({HARMONICS, SURFACE}),
+    has=frozenset({HARMONICS, SURFACE, FAR_LIGHT, METAL, PROPAGATION}),
     own=RefGaussianSettings,
 )

@@ -8,7 +8,17 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from rtgs.methods.family import DIFFUSE, REFLECTION, TRANSMITTANCE
-from rtgs.methods.spec import BEYOND_PAPER, GLASS, HARMONICS, MICROFACET, MIRROR, SURFACE, MethodSpec
+from rtgs.methods.spec import (
+    BEYOND_PAPER,
+    GLASS,
+    HARMONICS,
+    MICROFACET,
+    MIRROR,
+    PROPAGATION,
+    SABOTAGE,
+    SURFACE,
+    MethodSpec,
+)
 
 if TYPE_CHECKING:
     from rtgs.methods.model import Model
@@ -39,5 +49,5 @@ def build(setup: Setup) -> Model:
     return Model(setup, (base, mirror, glass), terms)
 
 
-_HAS = frozenset({HARMONICS, SURFACE, MIRROR, MICROFACET, GLASS, BEYOND_PAPER})
+_HAS = frozenset({HARMONICS, SURFACE, MIRROR, MICROFACET, GLASS, BEYOND_PAPER, PROPAGATION, SABOTAGE})
 SPEC = MethodSpec("rtgs", (DIFFUSE, REFLECTION, TRANSMITTANCE), build, _HAS)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from rtgs.methods import rtgs
-from rtgs.methods.spec import BEYOND_PAPER
+from rtgs.methods.spec import BEYOND_PAPER, PROPAGATION, SABOTAGE
 
-SPEC = replace(rtgs.SPEC, name="rtgs_printed", has=rtgs.SPEC.has - {BEYOND_PAPER})
+_HAS = rtgs.SPEC.has - {BEYOND_PAPER, PROPAGATION, SABOTAGE}  # the last two are EnvGS's, not in the paper
+SPEC = replace(rtgs.SPEC, name="rtgs_printed", has=_HAS)

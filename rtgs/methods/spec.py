@@ -31,7 +31,16 @@ MICROFACET = "microfacet"  # a weight of reflected light that follows from rough
 GLASS = "glass"  # a stage for what is seen through transparent objects
 BEYOND_PAPER = "beyond_paper"  # what rtgs adds to the paper: glass on a mesh of its own, lit by physics; first values
 RASTERIZED = "rasterized"  # rasterised Gaussians and nothing else: no ray starts from a pixel
-FEATURES = (HARMONICS, SURFACE, MIRROR, MICROFACET, GLASS, BEYOND_PAPER, RASTERIZED)
+PROPAGATION = "propagation"  # normals are propagated: from time to time Gaussians become opaque, mirrors grow
+SABOTAGE = "sabotage"  # and then colours that have baked in a reflection get noise
+FAR_LIGHT = "far_light"  # one map of the light of a far surrounding, which learns
+FORWARD = "forward"  # every Gaussian is shaded by itself, with a normal that bends from its shortest axis
+METAL = "metal"  # split-sum shading by metalness, roughness and albedo, light from the scene where a mesh is in the way
+FEATURE_LIGHT = "feature_light"  # that map holds features, and a network makes light of them
+FEATURES = (
+    *(HARMONICS, SURFACE, MIRROR, MICROFACET, GLASS, BEYOND_PAPER, RASTERIZED),
+    *(PROPAGATION, SABOTAGE, FAR_LIGHT, FORWARD, METAL, FEATURE_LIGHT),
+)
 
 StartOf = Callable[["MethodSettings", "ScheduleSettings"], int]
 Reads = Callable[["MethodSettings"], "MethodSettings"]

@@ -1,4 +1,7 @@
-"""Panels of pictures as papers print them: rows of scenes, columns of methods or layers, magnified crops beneath."""
+"""Panels of pictures as papers print them: rows of scenes, columns of methods or layers, magnified crops beneath.
+
+More columns than fit beside each other go on in the next line of their row.
+"""
 
 from __future__ import annotations
 
@@ -24,17 +27,20 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PHOTO = "photo"
-COLORS = ("image", "diffuse", "reflection", "transmission", "inner", "contents", "behind")
+ENVIRONMENT = "environment"
+COLORS = ("image", "diffuse", "reflection", "transmission", "inner", "contents", "behind", ENVIRONMENT)
 GREYS = ("specular", "roughness", "f0")
 WEIGHTS = {
     "reflected_weight": ("reflection", "reflected_color"),
     "transmitted_weight": ("transmission", "transmitted_color"),
 }
 LAYERS = (PHOTO, *COLORS, "error", "normal", "depth", *GREYS, *WEIGHTS)
-"""What a tile can show. ``diffuse`` is what the base set adds to the image; the weights are k_s w_r and k_s w_t."""
+"""What a tile can show. ``diffuse`` is what the base set adds to the image; the weights are k_s w_r and k_s w_t;
+``environment`` is the panorama of a far light, the same for all views."""
 _DARK = 1e-3  # light in which a weight cannot be told
 _TILE = 2.4  # inches across
 _LABEL = 0.15  # of a tile, across
+_MOST_ACROSS = 6  # tiles: with more the titles are too small to read where a page shows the whole figure
 _FRAMES = ("#e6194b", "#3cb44b", "#4363d8", "#f58231")  # of crops
 _DPI = 200
 
@@ -71,7 +77,8 @@ class Tile:
 
 @dataclass(frozen=True)
 class PanelRow:
-    """Tiles side by side. The boxes of ``crops`` are magnified beneath each."""
+    """Tiles side by side, in several lines where they are many. The boxes of ``crops`` are magnified beneath each that
+    has the shape of the first."""
 
     label: str
     tiles: tuple[Tile, ...]
@@ -84,7 +91,7 @@ def layer_pixels(
     """(H, W, 3) uint8 of one of :data:`LAYERS`; None: the method has no such layer.
 
     Args:
-        maps: as the step ``render`` stores them.
+        maps: as the step ``render`` stores them, and perhaps ``environment`` (3, h, w).
         photo: (3, H, W) in [0, 1].
         blend: ``method.optics.blend`` of the run: in which light the weights are.
 
@@ -135,27 +142,37 @@ def draw_panels(rows: Sequence[PanelRow], caption: str, path: Path) -> tuple[Pat
     columns = {len(row.tiles) for row in rows}
     if len(columns) != 1 or 0 in columns:
         raise RtgsError(f"figure {path.name}: its rows have {sorted(columns)} tiles; give all of them the same number")
-    (count,) = columns
-    heights = [height for row in rows for height in _heights(row)]
+    (whole,) = columns
+    lines, count = lines_of(whole)
+    heights = [height for row in rows for height in _heights(row) * lines]
     figure = Figure(figsize=((count + _LABEL) * _TILE, sum(heights) + 0.9), layout="constrained")
     grid = figure.add_gridspec(len(heights), count + 1, height_ratios=heights, width_ratios=[_LABEL] + [1.0] * count)
-    line = 0
+    top = 0
     for row in rows:
-        label = figure.add_subplot(grid[line, 0])
-        label.text(0.5, 0.5, row.label, rotation=90, ha="center", va="center", fontsize=8)
-        label.axis("off")
-        for place, tile in enumerate(row.tiles, start=1):
-            axes = figure.add_subplot(grid[line, place])
-            _show(axes, tile.pixels)
-            axes.set_title(tile.title, fontsize=8)
-            _frame(axes, tile.pixels, row.crops)
-            if row.crops:
-                strip = grid[line + 1, place].subgridspec(1, len(row.crops), wspace=0.05)
-                for index, box in enumerate(row.crops):
-                    _magnify(figure.add_subplot(strip[0, index]), tile.pixels, box, _FRAMES[index % len(_FRAMES)])
-        line += len(_heights(row))
+        deep = len(_heights(row))  # pictures, and perhaps crops beneath
+        for first in range(0, whole, count):
+            label = figure.add_subplot(grid[top, 0])
+            label.text(0.5, 0.5, row.label, rotation=90, ha="center", va="center", fontsize=8)
+            label.axis("off")
+            for place, tile in enumerate(row.tiles[first : first + count], start=1):
+                axes = figure.add_subplot(grid[top, place])
+                _show(axes, tile.pixels)
+                axes.set_title(tile.title, fontsize=8)
+                if row.crops and tile.pixels.shape == row.tiles[0].pixels.shape:
+                    _frame(axes, tile.pixels, row.crops)
+                    strip = grid[top + 1, place].subgridspec(1, len(row.crops), wspace=0.05)
+                    for index, box in enumerate(row.crops):
+                        color = _FRAMES[index % len(_FRAMES)]
+                        _magnify(figure.add_subplot(strip[0, index]), tile.pixels, box, color)
+            top += deep
     figure.supxlabel(textwrap.fill(caption, 42 * count), fontsize=8)
     return save_figure(figure, path)
+
+
+def lines_of(count: int) -> tuple[int, int]:
+    """In how many lines so many tiles stand, and how many beside each other in all but the last: about the same."""
+    lines = -(-count // _MOST_ACROSS)
+    return lines, -(-count // lines)
 
 
 def _heights(row: PanelRow) -> tuple[float, ...]:

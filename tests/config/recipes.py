@@ -23,6 +23,8 @@ from rtgs.workflow.plan import topological
 GOLDEN = Path(__file__).with_name("golden_recipes.json")
 TRAINED = tuple(name for name in choices_of("method") if not find_method(name).elsewhere)
 SCENES = ("ball_statue", "toycar", "matte_room")
+STAND_INS = {"ref_real/sedan": "sedan", "ref_real/gardenspheres": "spheres", "ref_real/toycar": "toycar"}
+SHIPPED = [f"scene.{key}" for key in ("format=auto", "images_dir=null", "model_dir=null", "resize_ratio=null")]
 TOLD_IN_FULL = ("ball_statue rtgs smoke none", "toycar envgs paper none")
 
 # Words beside scene, method and preset. They set keys in every room, defaults and values of YAML files among them.
@@ -72,35 +74,62 @@ OVERRIDES = (
 )
 
 
-def fitting(method: str) -> list[str]:
-    """The ablations that are for the method, ``none`` first."""
+def about_ablation(name: str) -> dict:
+    """What the file of an ablation says of itself: ``why``, ``needs``, ``idle_with``."""
+    return yaml.safe_load((conf_dir() / "ablation" / f"{name}.yaml").read_text())["ablation"]
+
+
+def fitting(method: str, preset: str = "") -> list[str]:
+    """The ablations that are for the method, and with a preset for this one, ``none`` first."""
     found = ["none"]
     for name in choices_of("ablation"):
-        needs = set(yaml.safe_load((conf_dir() / "ablation" / f"{name}.yaml").read_text())["ablation"].get("needs", ()))
-        if name != "none" and needs <= find_method(method).has:
-            found.append(name)
+        about = about_ablation(name)
+        if name != "none" and set(about.get("needs", ())) <= find_method(method).has:
+            found += [name] if preset not in about.get("idle_with", ()) else []
     return found
+
+
+def flat_leaves(values: dict, *before: str) -> Iterator[tuple[str, object]]:
+    """Dotted keys and values of a file of ``conf/``, without what it says about itself."""
+    for key, value in values.items():
+        if isinstance(value, dict) and key != "ablation":
+            yield from flat_leaves(value, *before, key)
+        elif key != "ablation":
+            yield ".".join((*before, key)), value
 
 
 def recipes(method: str) -> Iterator[tuple[str, list[str]]]:
     """Runs of a method: each in words, and ``step fingerprint`` of all its steps but the report, upstream first.
 
-    Ablations go with the published preset, every preset with none. A report states every value with its default: it is
-    made in seconds, and its recipe may change.
+    Ablations go with the published preset, or with quick where that has nothing to take away, every preset with none,
+    and where a scene has published numbers of its own, it with them (``scene=sedan envgs ...``). A report states every
+    value with its default: it is made in seconds, and its recipe may change.
     """
     paths = ",".join(f"embedded:{scene}" for scene in SCENES)  # as a value, for files are composed once for all three
     inspections = Inspections()
     with patch("rtgs.pretrained.weights.weight_folders", tuple):  # a machine without networks
-        for presets, ablations in (("paper", fitting(method)), ("smoke,quick,standard", ["none"])):
+        idle = [name for name in fitting(method) if name not in fitting(method, "paper")]
+        chosen = [("paper", fitting(method, "paper")), ("smoke,quick,standard", ["none"])]
+        for presets, ablations in [*chosen, ("quick", idle)] if idle else chosen:
             files = [f"method={method}", f"preset={presets}", f"ablation={','.join(ablations)}"]
             for job in _jobs(["scene=ball_statue", *files, f"scene.path={paths}"]):
                 assert job.config is not None
                 assert job.choices is not None
                 scene = job.config.scene.path.split(":")[1]
                 yield f"{scene} {method} {job.choices.preset} {job.choices.ablation}", steps_of(job, inspections)
+        for scene in scenes_of(method):
+            path = f"scene.path=embedded:{STAND_INS.get(scene, scene)}"  # the papers' captures are not shipped
+            (job,) = _jobs([f"scene={scene}", f"method={method}", "preset=paper", path, *SHIPPED])
+            yield f"scene={scene} {method} paper none", steps_of(job, inspections)
         for words in (words for of, words in OVERRIDES if of == method):
             (job,) = _jobs(["scene=ball_statue", f"method={method}", "preset=smoke", *words.split()])
             yield f"ball_statue {method} smoke {words}", steps_of(job, inspections)
+
+
+def scenes_of(method: str) -> list[str]:
+    """The scenes for which the method has published numbers of their own."""
+    folder = conf_dir() / "method_on_scene" / "paper" / method
+    return sorted(path.relative_to(folder).with_suffix("").as_posix() for path in folder.rglob("*.yaml"))
 
 
 def _jobs(words: Sequence[str]) -> tuple[ComposedJob, ...]:

@@ -72,6 +72,7 @@ def test_how_the_register_is_read():
     assert read.here == {DEFAULT: 1 / 60, ("method=rtgs", "preset=quick"): 0.1}
     assert read.also == (0.0, 1.0)
     assert overrides_of("ablation=mcmc") == (*DEFAULT, "ablation=mcmc")
+    assert overrides_of("method=envgs scene=sedan") == ("preset=paper", "method=envgs", "scene=sedan")
     with pytest.raises(ValueError, match="here"):
         setting_of("a.b", "`1.0`, but not always", "`0.0`")
     with pytest.raises(ValueError, match="decision 7"):

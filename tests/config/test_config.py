@@ -4,7 +4,7 @@ import dataclasses
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from itertools import cycle, product
 from pathlib import Path
 
@@ -15,10 +15,8 @@ from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
-from recipes import TRAINED
+from recipes import TRAINED, fitting, scenes_of
 
-from pipelines.planning.graph import build_graph
-from pipelines.planning.inspection import Inspections
 from rtgs.config import RunConfig, compose
 from rtgs.config.convert import derive_name, to_run_config
 from rtgs.config.explain import explain
@@ -29,12 +27,9 @@ from rtgs.config.sweep import compose_jobs
 from rtgs.core.build import build
 from rtgs.core.errors import RtgsError
 from rtgs.evaluate.tables import PAPER_SCORES
-from rtgs.methods import find_method
 from rtgs.train.settings import ScheduleSettings
 from rtgs.workflow.fingerprint import fingerprint
 
-ABLATIONS = [name for name in choices_of("ablation") if name != "none"]
-WHOLE_MODELS = {"no_mesh_guide", "learned_glass", "paper_glass"}
 SCENES = [name for name in choices_of("scene") if name != "capture"]
 
 
@@ -195,56 +190,11 @@ def test_a_scene_is_named_after_its_folder(path, name):
     assert derive_name(path) == name
 
 
-def keys_in(group: str, name: str) -> set[str]:
-    """What a file of ``conf/`` and those that it inherits from set."""
-
-    values = yaml.safe_load((conf_dir() / group / f"{name}.yaml").read_text())
-    others = [other for other in values.pop("defaults", ()) if other != "_self_"]
-    inherited = (keys_in(".", other[1:]) if other.startswith("/") else keys_in(group, other) for other in others)
-    return {key for key, _ in flat_leaves(values)}.union(*inherited)
-
-
-def test_method_preset_and_ablation_compose_and_no_ablation_is_idle():
-    """Method x ablation on one scene, composed by Hydra; what an ablation is not for is refused.
-
-    What an ablation takes away is read by training: the key of its last step is another one, for every method it is
-    for, with the published preset, and with every preset that sets a key of the ablation. That scenes add nothing to
-    this is the test after it; `-m slow` walks the product itself.
-    """
-    presets = {name: keys_in("preset", name) for name in choices_of("preset")}
-    methods = {name: methods_of(name) for name in ABLATIONS}
-    keys: dict[tuple[str, str, str], str] = {}
-    inspections = Inspections()
-    for method, preset in product(TRAINED, presets):
-        meet = [name for name in ABLATIONS if preset == "paper" or keys_in("ablation", name) & presets[preset]]
-        mine = ["none", *(name for name in meet if method in methods[name])]
-        words = [f"method={method}", f"preset={preset}", f"ablation={','.join(mine)}"]
-        for job in compose_jobs(["scene=ball_statue", *words], multirun=True)[0]:
-            chosen = dict(word.split("=") for word in job.words)
-            assert job.config is not None, job.problem
-            assert job.choices is not None
-            assert job.config.ablation.why
-            graph = build_graph(job.config, job.choices, inspections)
-            assert not graph.unread, "no file gives a weight to a loss that the method lacks"
-            keys[method, preset, chosen["ablation"]] = graph.training[-1].fingerprint
-    assert len(keys) > sum(map(len, methods.values())) + len(presets)
-    for method in choices_of("method"):
-        unfit = {tuple(methods[name]): name for name in ABLATIONS if method not in methods[name]}
-        others = sorted(unfit.values())  # one of each sort; `-m slow` takes all
-        words = ["scene=ball_statue", f"method={method}", "preset=smoke", f"ablation={','.join(others)}"]
-        for name, job in zip(others, compose_jobs(words, multirun=True)[0] if others else (), strict=True):
-            assert f"ablation={name} takes nothing away from method {method}" in job.problem
-    for (method, preset, ablation), key in keys.items():
-        if ablation != "none":
-            assert key != keys[method, preset, "none"], f"ablation {ablation} changes nothing in {method} {preset}"
-    assert len(set(keys.values())) == len(keys), "two ablations of a method are the same"
-
-
 def test_scenes_share_nothing_with_methods_and_ablations():
     """Every scene composes; of the other files only presets touch a scene, and of it only its size.
 
     Scenes and methods set nothing but their own keys (tests below), so a scene adds to method x preset x ablation
-    nothing but its own part with the size of the preset.
+    nothing but its own part with the size of the preset, and what a method has on it (test_published_scenes.py).
     """
     for group in ("preset", "ablation"):
         for name in choices_of(group):
@@ -280,20 +230,26 @@ def test_the_whole_product_composes():
                 continue
             names.add((scene, config.name))
             if key in beside:
-                assert (config, choices) == compose(words_of("scene method preset ablation", key))
+                whole, chosen = compose(words_of("scene method preset ablation", key))
+                assert chosen == choices
+                assert whole == config or (preset == "paper" and scene in scenes_of(method))
     assert len(names) + len(refused) == len(combinations) * len(SCENES)
     for (_, method, _, ablation), problem in refused.items():
         assert f"ablation={ablation} takes nothing away from method {method}" in problem
-    unfit = {(name, method) for name in ABLATIONS for method in methods if method not in methods_of(name)}
-    assert {(ablation, method) for _, method, _, ablation in refused} == unfit
+    assert {key[1:] for key in refused} == {key for key in combinations if not fits(*key)}
+
+
+def fits(method: str, preset: str, ablation: str) -> bool:
+    """The ablation takes something away from the method with this preset."""
+    return ablation == "none" or (method in TRAINED and ablation in fitting(method, preset))
 
 
 def beside_hydra() -> set[tuple[str, ...]]:
     """Combinations among which every file comes up, and every method with every ablation that is for it."""
     scenes, presets = cycle(SCENES), cycle(choices_of("preset"))
     pairs = product(choices_of("method"), choices_of("ablation"))
-    fit = [(method, name) for method, name in pairs if name == "none" or method in methods_of(name)]
-    return {(next(scenes), method, next(presets), name) for method, name in fit}
+    found = {(next(scenes), method, next(presets), name) for method, name in pairs}
+    return {key for key in found if fits(*key[1:])}
 
 
 def words_of(groups: str, names: Sequence[str]) -> list[str]:
@@ -309,17 +265,6 @@ def raw_configs(groups: str, keys: Sequence[tuple[str, ...]]) -> dict[tuple[str,
     for composed in found.values():
         OmegaConf.set_readonly(composed, False)
     return found
-
-
-def methods_of(ablation: str) -> tuple[str, ...]:
-    """The methods that have what an ablation takes away."""
-    needs = set(ablation_file(ablation)["ablation"].get("needs", ()))
-    return tuple(name for name in TRAINED if needs <= find_method(name).has)
-
-
-def ablation_file(name: str) -> dict:
-    """What the file of an ablation says."""
-    return yaml.safe_load((conf_dir() / "ablation" / f"{name}.yaml").read_text())
 
 
 @pytest.mark.parametrize("experiment", choices_of("experiment"))
@@ -338,33 +283,6 @@ def test_a_scene_sets_no_keys_but_its_own(scene):
     text = (conf_dir() / "scene" / f"{scene}.yaml").read_text()
     assert "@package" not in text
     assert {"name", "path"} <= set(yaml.safe_load(text))
-
-
-@pytest.mark.parametrize("ablation", ABLATIONS)
-def test_an_ablation_flips_one_to_three_keys_and_says_why(ablation):
-    """Or puts a published model as a whole in the place of ours, or takes away whatever reads the mesh."""
-    content = ablation_file(ablation)
-    why = content.pop("ablation")["why"]
-    assert why.strip()
-    assert "\n" not in why.strip()
-    keys = dict(flat_leaves(content))
-    assert keys
-    if ablation not in WHOLE_MODELS:
-        assert len(keys) <= 3
-
-
-def test_the_papers_glass_is_the_learned_one_and_more():
-    learned, paper = (dict(flat_leaves(ablation_file(name))) for name in ("learned_glass", "paper_glass"))
-    assert learned.items() <= paper.items()
-
-
-def flat_leaves(values: dict, *before: str) -> Iterator[tuple[str, object]]:
-    """Dotted keys and values of a file of ``conf/``, without what it says about itself."""
-    for key, value in values.items():
-        if isinstance(value, dict) and key != "ablation":
-            yield from flat_leaves(value, *before, key)
-        elif key != "ablation":
-            yield ".".join((*before, key)), value
 
 
 EXPERIMENTS = choices_of("experiment")

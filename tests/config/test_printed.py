@@ -13,7 +13,7 @@ from rtgs.config import compose
 from rtgs.config.locate import choices_of, conf_dir
 from rtgs.config.schema import RunConfig
 from rtgs.methods import find_method
-from rtgs.methods.spec import BEYOND_PAPER
+from rtgs.methods.spec import BEYOND_PAPER, PROPAGATION, SABOTAGE
 from rtgs.optics.microfacet import specular_weights
 from rtgs.workflow.fingerprint import flatten
 
@@ -88,7 +88,7 @@ def test_the_weight_of_a_reflection_has_no_bound_and_starts_as_a_dielectrics():
 
 def test_it_has_what_rtgs_has_but_what_rtgs_adds():
     ours, printed = find_method("rtgs"), find_method("rtgs_printed")
-    assert ours.has - printed.has == {BEYOND_PAPER}
+    assert ours.has - printed.has == {BEYOND_PAPER, PROPAGATION, SABOTAGE}
     assert (printed.stages, printed.build) == (ours.stages, ours.build)
 
 

@@ -59,11 +59,10 @@ def setting_of(key: str, here: str, also: str) -> Setting:
 
 
 def overrides_of(told: str | None) -> tuple[str, ...]:
-    """The overrides of a value: the default ones, with what the cell names in place of its group."""
-    if told is None:
-        return DEFAULT
-    group = told.split("=")[0]
-    return (*(item for item in DEFAULT if not item.startswith(f"{group}=")), told)
+    """The overrides of a value: the default ones, with what the cell names in place of its groups."""
+    words = () if told is None else tuple(told.split())
+    groups = {word.split("=")[0] for word in words}
+    return (*(item for item in DEFAULT if item.split("=")[0] not in groups), *words)
 
 
 def entries(text: str) -> tuple[Entry, ...]:

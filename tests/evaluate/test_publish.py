@@ -252,6 +252,23 @@ def test_every_published_row_stands_beside_what_was_run_in_columns_of_its_own(tm
     assert all("15.14 / 0.660 / 0.479" in texts[suffix] for suffix in (".md", ".tex", ".html"))
 
 
+def test_a_method_that_the_paper_does_not_have_has_a_row_without_published_figures(tmp_path):
+    runs = [run("3dgs_dr", "sedan", 25.0), run("envgs", "sedan", 26.0)]
+    for data in ("stand_in", "paper"):
+        table = build_table(TableSpec("table1", "Table 1", data), runs)
+        assert table.methods == ("3dgs_dr", "envgs")
+        assert [row for row, _ in table.published].count("3dgs_dr") == 0
+        row = next(line for line in markdown(table).splitlines() if line.startswith("| 3dgs_dr |"))
+        assert "*25.00*" in row or "<u>25.00</u>" in row
+        assert "26.14" not in row
+        texts = {path.suffix: path.read_text() for path in write_table(tmp_path / data, table)}
+        assert all("25.00" in text for suffix, text in texts.items() if suffix != ".csv")
+        cells = next(row for row in csv.DictReader(io.StringIO(texts[".csv"])) if row["method"] == "3dgs_dr")
+        published = [cells[key] for key in cells if key.startswith(("published_", "paper_")) and key != "paper_scene"]
+        assert published
+        assert not any(published)
+
+
 def test_a_judged_row_is_no_ablation():
     rows = [
         {row for row, _ in build_table(STAND_IN, [run(label, "ball_statue", 28.0)]).published}

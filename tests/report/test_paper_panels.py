@@ -12,7 +12,7 @@ from PIL import Image
 from rtgs.core.cameras import Camera
 from rtgs.core.errors import RtgsError
 from rtgs.evaluate.curves import Look, QualityCurve
-from rtgs.report.panels import LAYERS, Box, PanelRow, Tile, draw_panels, layer_pixels
+from rtgs.report.panels import LAYERS, Box, PanelRow, Tile, draw_panels, layer_pixels, lines_of
 from rtgs.report.time_quality import draw_time_quality
 
 SIZE = (12, 16)
@@ -25,6 +25,7 @@ def maps() -> dict[str, torch.Tensor]:
     normal = torch.zeros(3, *SIZE)
     normal[2] = -1
     lights = {"reflection": color / 4, "reflected_color": color, "transmission": color / 2, "transmitted_color": color}
+    lights["environment"] = color
     rest = {"inner": color, "contents": color, "behind": color, "normal": normal, "depth": 1 + torch.rand(SIZE)}
     return {"image": PHOTO, "diffuse": color, "specular": flat, "roughness": flat, "f0": flat} | lights | rest
 
@@ -78,6 +79,30 @@ def test_panels_are_drawn_with_frames_and_crops_to_the_same_bytes(tmp_path: Path
     assert {(128, 128, 128), (0xE6, 0x19, 0x4B), (0x3C, 0xB4, 0x4B)} <= colors
     with pytest.raises(RtgsError, match=r"its rows have \[1, 2\] tiles"):
         draw_panels([rows[0], PanelRow("c", tiles[:1])], "", tmp_path / "three")
+
+
+def test_many_columns_stand_in_lines_that_are_about_as_long():
+    assert [lines_of(count) for count in (1, 5, 6, 7, 9, 10, 12, 13)] == [
+        *((1, 1), (1, 5), (1, 6), (2, 4), (2, 5), (2, 5), (2, 6), (3, 5))
+    ]
+
+
+def test_what_does_not_fit_beside_goes_below_and_crops_are_of_pictures_like_the_first(tmp_path: Path):
+    grey, panorama = np.full((*SIZE, 3), 128, np.uint8), np.full((8, 16, 3), 200, np.uint8)
+    crops = (Box(0.1, 0.1, 0.3, 0.3),)
+    sizes = []
+    for count in (5, 6, 9):
+        tiles = (*(Tile(grey, f"method {k}") for k in range(count - 1)), Tile(panorama, "far light"))
+        picture, _ = draw_panels([PanelRow("sedan", tiles, crops)], "A caption.", tmp_path / str(count))
+        pixels = np.asarray(Image.open(picture).convert("RGB")).reshape(-1, 3)
+        frames = int((pixels == (0xE6, 0x19, 0x4B)).all(1).sum())
+        sizes.append((Image.open(picture).size, frames))
+    (five, few), (six, more), (nine, most) = sizes
+    assert nine[0] == five[0] < six[0]  # five beside each other
+    assert five[1] == six[1] < 0.6 * nine[1]
+    assert few < more < most
+    alone, _ = draw_panels([PanelRow("a", (Tile(grey), Tile(panorama)))], "", tmp_path / "alone")
+    assert (200, 200, 200) in {tuple(color) for color in np.asarray(Image.open(alone).convert("RGB")).reshape(-1, 3)}
 
 
 def test_curves_of_a_scene_are_drawn_with_their_masks(tmp_path: Path):

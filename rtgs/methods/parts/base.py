@@ -162,11 +162,17 @@ class BaseSet(Part):
     @torch.no_grad()
     def weight_of(self, chosen: Tensor, camera: Camera, step: int) -> tuple[Tensor, Tensor]:
         """(H, W) weight with which the Gaussians ``chosen`` (N,) bool are composited, and that of all of them."""
+        sums, every = self.sums_of(chosen.float()[:, None].expand(-1, 3).contiguous(), camera, step)
+        return sums[0], every
+
+    @torch.no_grad()
+    def sums_of(self, values: Tensor, camera: Camera, step: int) -> tuple[Tensor, Tensor]:
+        """(3, H, W) sums of ``values`` (N, 3) by the weights with which the Gaussians are composited, and (H, W) the
+        sum of these weights."""
         rows = self.set.activated(camera.center.float(), self.sh_degree(step))
-        features = chosen.float()[:, None].expand(-1, 3).contiguous()
         plain = RasterRequest(camera, RenderOptions(), False, None, torch.zeros(3), self.settings.render, self.extent)
-        buffers = self.kind.rasterize(rows, features, plain)
-        return buffers.features[0], buffers.alpha
+        buffers = self.kind.rasterize(rows, values, plain)
+        return buffers.features, buffers.alpha
 
     @torch.no_grad()
     def median_depth(self, camera: Camera, step: int) -> Tensor:

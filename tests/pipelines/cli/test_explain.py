@@ -67,6 +67,22 @@ def test_a_key_is_told_with_value_default_place_and_sentence():
     assert explained("mesh.source")["choices"] == "auto, hull, tsdf, given"
 
 
+def test_where_a_value_is_that_of_another_key_the_places_of_that_key_are_told():
+    words = ("scene=ref_real/sedan", "method=envgs", "preset=paper")
+    rows = explained("schedule.total", *words)
+    place = "conf/preset/paper.yaml, which takes method.paper_schedule.total, set in "
+    file = "conf/method_on_scene/paper/envgs/sedan.yaml"
+    assert (rows["value"], rows["set in"]) == ("60000", f"{place}{file} (before it conf/method/envgs.yaml: 40000)")
+    over = explained("schedule.total", *words, "method.paper_schedule.total=7")
+    assert over["value"] == "7"
+    assert over["set in"].startswith(f"{place}command line (before it {file}: 60000")
+    rows = explained("schedule.evaluate_every", *words)
+    assert rows["set in"].endswith("takes method.paper_schedule.evaluate_every, set nowhere: the default")
+    rows = explained("method.own.scope_radius", "scene=ref_real/toycar", "method=ref_gs", "preset=paper")
+    assert rows["value"] == "2.507"
+    assert rows["set in"].startswith("conf/method_on_scene/paper/ref_gs/ref_real/toycar.yaml (before it ")
+
+
 def test_passwords_are_not_told(monkeypatch, capsys):
     uri = "http://me:hunter2's secret@127.0.0.1:9/" + 200 * "long"
     monkeypatch.setenv("RTGS_TRACKING_URI", "")
@@ -238,4 +254,5 @@ def test_help_lists_groups_that_can_be_chosen(capsys):
     assert "\npreset: " in said
     assert "after_preset" not in said
     assert "method_in_preset" not in said
+    assert "method_on_scene" not in said
     assert "figure: " not in said

@@ -12,9 +12,10 @@ import yaml
 from PIL import Image
 
 from pipelines.cli.main import main
-from pipelines.publishing.figures import figure_names, read_figure
+from pipelines.publishing.figures import Runs, figure_names, read_figure
 from rtgs.config.locate import choices_of, conf_dir
 from rtgs.core.errors import RtgsError
+from rtgs.methods import find_method
 from rtgs.report.panels import LAYERS, Box
 from tests.pipelines.app_cases import NAMED, QUICK, _in_root, capture, root  # noqa: F401  (fixtures)
 
@@ -59,7 +60,8 @@ def test_rows_and_columns_that_are_none_are_named(capture: Path, tmp_path: Path,
     with pytest.raises(RtgsError, match=r"mine\.yaml cannot be read as a record .*colums"):
         read_figure(describe(tmp_path, capture, colums=[]))
     assert main(["figures", "tabel1"]) == 1
-    assert "no figure 'tabel1': there are ablation, decomposition, split_sum, table1, table2" in capsys.readouterr().err
+    told = "no figure 'tabel1': there are ablation, decomposition, environment, split_sum, table1, table2"
+    assert told in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", figure_names())
@@ -71,9 +73,56 @@ def test_shipped_figures_name_scenes_methods_and_layers_that_are_there(name: str
         assert all(Box(*crop).width > 0 for crop in row.crops)
     for column in spec.columns:
         assert column.layer in LAYERS
-        for word in column.words:
+    for words in (each.words for each in (*spec.rows, *spec.columns)):
+        for word in words:
             group, _, choice = word.partition("=")
             assert choice in choices_of(group)
+
+
+@pytest.mark.parametrize("name", ["table1", "table2"])
+def test_the_figures_of_the_tables_show_all_that_their_tables_run(name: str):
+    experiment = yaml.safe_load((conf_dir() / "experiment" / f"{name}.yaml").read_text())
+    run = experiment["hydra"]["sweeper"]["params"]
+    spec = read_figure(conf_dir() / "figure" / f"{name}.yaml")
+    shown = [word.removeprefix("method=") for column in spec.columns for word in column.words]
+    assert shown == run["method"].split(",")
+    assert {row.scene for row in spec.rows} == set(run["scene"].split(","))
+
+
+def test_the_figure_of_the_far_light_is_of_the_methods_that_have_one_and_of_runs_of_a_table():
+    spec = read_figure(conf_dir() / "figure" / "environment.yaml")
+    shown = [word.removeprefix("method=") for row in spec.rows for word in row.words]
+    assert shown == [name for name in choices_of("method") if "far_light" in find_method(name).has]
+    assert "environment" in {column.layer for column in spec.columns}
+    experiment = yaml.safe_load((conf_dir() / "experiment" / "table1.yaml").read_text())
+    run = experiment["hydra"]["sweeper"]["params"]
+    assert {row.scene for row in spec.rows} <= set(run["scene"].split(","))
+    assert set(shown) <= set(run["method"].split(","))
+
+
+def test_rows_may_be_of_several_methods_on_one_scene(capture: Path, root: Path, tmp_path: Path, capsys):
+    rows = [{"scene": str(capture), "words": [f"method={method}"]} for method in ("2dgs", "3dgs_dr")]
+    columns = [{"title": "photo", "layer": "photo"}, {"title": "image"}]
+    columns.append({"title": "far light", "layer": "environment"})
+    figure = describe(tmp_path, capture, rows=rows, columns=columns)
+    for method in ("2dgs", "3dgs_dr"):
+        assert main(["run", f"scene={capture}", f"method={method}", *QUICK]) == 0
+    capsys.readouterr()
+    assert main(["figures", str(figure), "preset=smoke", *KEYS]) == 0
+    caption = (root / "figures" / "mine-smoke" / "caption.txt").read_text()
+    assert "2dgs " in caption
+    assert "3dgs_dr " in caption
+    runs = Runs([f"paths.root={root}", "preset=smoke", *KEYS])
+    spec = read_figure(figure)
+    plain, lit = (runs.of(row, spec.columns[2]) for row in spec.rows)
+    (view, *_) = lit.scene.test
+    assert plain.pixels(view, "environment") is None
+    panorama = lit.pixels(view, "environment")
+    assert panorama is not None
+    assert panorama.shape == (256, 512, 3)
+    named = describe(tmp_path, capture, rows=[*rows, {"scene": str(capture)}], columns=columns)
+    with pytest.raises(RtgsError, match="has no rows, or no column with the words of a run"):
+        read_figure(named)
 
 
 def test_a_training_that_looks_has_a_curve_and_others_keep_their_keys(capture: Path, root: Path, capsys):
