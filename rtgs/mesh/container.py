@@ -267,11 +267,14 @@ class ObjectGuide:
         self.cache_views = cache_views
         self.casts = 0  # cameras whose rays were cast: the rest came from the cache
         self._cache: dict[tuple[object, ...], _Cached] = {}
+        self._last: tuple[tuple[object, ...], ObjectSurfaces] | None = None  # a step asks for a camera several times
         self._counts: dict[tuple[object, ...], tuple[int, int]] = {}
 
     def surfaces(self, camera: Camera) -> ObjectSurfaces:
         """First and second surface along the camera's pixel rays. A pane has no second surface."""
         key = camera_key(camera)
+        if self._last is not None and self._last[0] == key:
+            return self._last[1]
         found = self._cache.pop(key, None)
         if found is None:
             found = self._cast(camera)
@@ -281,7 +284,9 @@ class ObjectGuide:
             self._cache[key] = found  # the newest is last
             while len(self._cache) > self.cache_views:
                 del self._cache[next(iter(self._cache))]
-        return _spread(found, camera)
+        surfaces = _spread(found, camera)
+        self._last = (key, surfaces) if self.cache_views else None
+        return surfaces
 
     def counts(self) -> dict[str, int]:
         """Pixels over all cameras asked for so far, each camera once: ``hit``, ``second``, ``one_hit`` (no second)."""
@@ -341,12 +346,12 @@ def _spread(found: _Cached, camera: Camera) -> ObjectSurfaces:
     index = found.pixels.long()
     hit, second = torch.zeros(size, dtype=torch.bool), torch.zeros(size, dtype=torch.bool)
     near, far, normal = torch.zeros(size), torch.zeros(size), torch.zeros(3, size)
-    hit[index], second[index] = True, found.second
-    near[index], far[index] = found.near, found.far
     facing = found.normal.float()
-    normal[:, index] = facing * facing.square().sum(0).clamp_min(1e-12).rsqrt()
     triangle = torch.full((size,), -1, dtype=torch.int32)
-    triangle[index] = found.triangle
+    hit.index_fill_(0, index, True)
+    for full, own in ((second, found.second), (near, found.near), (far, found.far), (triangle, found.triangle)):
+        full.index_copy_(0, index, own)
+    normal.index_copy_(1, index, facing * facing.square().sum(0).clamp_min(1e-12).rsqrt())
     maps = (hit.view(shape), near.view(shape), far.view(shape), second.view(shape))
     return ObjectSurfaces(*maps, normal.view(3, *shape), triangle.view(shape))
 

@@ -44,7 +44,7 @@ class Leg:
         """The stretches ``chosen`` (int64), with other parents."""
         values = (self.origin, self.direction, self.length, self.cosine, self.wall)
         met = None if self.met is None else self.met.rows(chosen)
-        return Leg(parent, *(each[chosen] for each in values), met=met)
+        return Leg(parent, *(each.index_select(0, chosen) for each in values), met=met)
 
 
 @dataclass(frozen=True)
@@ -65,18 +65,22 @@ class InnerPaths:
 
     def take(self, wanted: Tensor) -> tuple[Tensor, InnerPaths]:
         """Of pixels ``wanted`` (R,) int64: (K',) rows of it that have a path, and these paths in that order."""
-        place = torch.searchsorted(self.pixels, wanted).clamp_max(max(len(self.pixels) - 1, 0))
-        found = self.pixels[place] == wanted if len(self.pixels) else torch.zeros(len(wanted), dtype=torch.bool)
-        rows = found.nonzero()[:, 0]
-        chosen, count = place[rows], len(self.pixels)
+        count = 1 + max((int(each.max()) for each in (self.pixels, wanted) if len(each)), default=0)
+        place = _inverse(self.pixels, count).index_select(0, wanted)
+        rows = (place >= 0).nonzero()[:, 0]
+        chosen, count = place.index_select(0, rows), len(self.pixels)
         legs, before = [], chosen
         for leg in self.legs:
-            new = torch.full((count,), -1, dtype=torch.int64).index_copy(0, before, torch.arange(len(before)))
-            kept = chosen if not legs else (new[leg.parent] >= 0).nonzero()[:, 0]
-            legs.append(leg.rows(kept, torch.arange(len(kept)) if not legs else new[leg.parent[kept]]))
+            kept, parent = chosen, torch.arange(len(chosen))
+            if legs:
+                new = _inverse(before, count).index_select(0, leg.parent)
+                kept = (new >= 0).nonzero()[:, 0]
+                parent = new.index_select(0, kept)
+            legs.append(leg.rows(kept, parent))
             before, count = kept, len(leg.length)
         met = None if self.met is None else self.met.rows(chosen)
-        return rows, InnerPaths(self.pixels[chosen], self.cosine[chosen], tuple(legs), met)
+        pixels, cosine = (each.index_select(0, chosen) for each in (self.pixels, self.cosine))
+        return rows, InnerPaths(pixels, cosine, tuple(legs), met)
 
 
 class InnerGuide:
@@ -171,6 +175,11 @@ class InnerGuide:
         normal = interpolated(self.mesh.mesh, self.mesh.corners, triangle, points).astype(np.float64)
         along = (normal * unit).sum(1, keepdims=True)
         return np.where(along > 0, -normal, normal)
+
+
+def _inverse(rows: Tensor, count: int) -> Tensor:
+    """(count,) int64: where each number is in ``rows``; -1: nowhere."""
+    return torch.full((count,), -1, dtype=torch.int64).index_copy_(0, rows, torch.arange(len(rows)))
 
 
 def _float(values: np.ndarray) -> Tensor:

@@ -298,6 +298,11 @@ def test_widened_masks():
     grown = widened(inside, 1)
     assert int(grown.sum()) == 9
     assert bool(grown[1:4, 2:5].all())
+    for height, width in ((9, 13), (1, 6), (4, 1)):
+        drawn = torch.rand(height, width, generator=torch.Generator().manual_seed(0)) > 0.8
+        for pixels in (1, 2, 5):
+            largest = torch.nn.functional.max_pool2d(drawn[None].float(), 2 * pixels + 1, stride=1, padding=pixels)
+            assert torch.equal(widened(drawn, pixels), largest[0] > 0)
 
 
 def test_monocular_normals_may_count_more_on_the_object(plain: GlassScene):

@@ -212,6 +212,18 @@ def test_before_it_is_judged_a_part_is_open_by_turns_in_training_alone(standing:
     assert known == [False, True, False, False]
 
 
+def test_paths_behind_walls_stay_found_where_nothing_is_judged_open(standing: GlassScene):
+    glass = begun(fresnel(openings=0.5), standing).parts["glass"]
+    assert isinstance(glass, Glass)
+    assert glass.wall is not None
+    glass.wall.set_for(30)
+    closed = glass.wall._inner
+    glass.wall.set_for(31)
+    assert glass.wall._inner is not closed
+    glass.wall.restore({})
+    assert glass.wall._inner is closed
+
+
 def looked(method: Model, step: int) -> Look:
     """As the model looks at its training views between steps."""
 

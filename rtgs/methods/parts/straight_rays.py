@@ -147,9 +147,9 @@ class StraightRays:
             frame.camera, wanted, self.watched, probe, torch.zeros(3), self.settings.render, self.base.extent
         )
         buffers = SURFELS.rasterize(rows, rows.colors, request)
-        alpha = buffers.alpha.flatten()[pixels]
-        depth = None if buffers.depth is None else buffers.depth.flatten()[pixels] - rays.near * alpha
-        met = TraceBuffers(buffers.features.flatten(1)[:, pixels].T, None, alpha, depth)
+        alpha = buffers.alpha.flatten().index_select(0, pixels)
+        depth = None if buffers.depth is None else buffers.depth.flatten().index_select(0, pixels) - rays.near * alpha
+        met = TraceBuffers(buffers.features.flatten(1).index_select(1, pixels).T, None, alpha, depth)
         if probe is None or buffers.weight_sum is None:
             return met, ()
         return met, (Observation(own.name, probe, buffers.weight_sum),)

@@ -154,8 +154,8 @@ class WallLight:
     def _adopt(self, found: Openings | None) -> None:
         self._openings = found
         self._judged = self._closed if found is None else found.faces
-        self._guides.clear()
         self._open(self._judged)
+        self._guides = {key: guide for key, guide in self._guides.items() if guide is self._inner}
 
     def _open(self, faces: Tensor) -> None:
         """Faces (F,) bool of the mesh are openings, where no wall is; all others are walls."""

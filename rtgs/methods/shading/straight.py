@@ -39,8 +39,8 @@ class GlassRays:
 
     def at(self, depth: Tensor, rows: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Origins at these z-depths and directions, of all rays or of some."""
-        directions = self.directions if rows is None else self.directions[rows]
-        center = self.center if rows is None or self.center.ndim == 1 else self.center[rows]
+        directions = self.directions if rows is None else self.directions.index_select(0, rows)
+        center = self.center if rows is None or self.center.ndim == 1 else self.center.index_select(0, rows)
         return center + depth[:, None] * directions, directions
 
 
@@ -92,19 +92,22 @@ def glass_pixels(
 
 def widened(inside: Tensor, pixels: int) -> Tensor:
     """(H, W) bool with ``pixels`` more on every side."""
-    if pixels == 0:
-        return inside
-    grown = torch.nn.functional.max_pool2d(inside[None].float(), 2 * pixels + 1, stride=1, padding=pixels)
-    return grown[0] > 0
+    for _ in range(pixels):
+        rows = inside.clone()
+        rows[1:] |= inside[:-1]
+        rows[:-1] |= inside[1:]
+        inside = rows.clone()
+        inside[:, 1:] |= rows[:, :-1]
+        inside[:, :-1] |= rows[:, 1:]
+    return inside
 
 
 def glass_rays(glass: GlassPixels, index: Tensor, center: Tensor, view: Tensor) -> GlassRays:
     """The straight rays of the traced pixels ``index`` (P,) that show the object; ``view`` (3, H * W) world rays."""
-    rows = glass.inside[index].nonzero()[:, 0]
-    pixels = index[rows]
-    near = glass.flat.depth.detach()[pixels]
-    directions = view[:, pixels].T.contiguous()
-    return GlassRays(rows, len(index), center, directions, near, glass.far[pixels], glass.second[pixels])
+    rows = glass.inside.index_select(0, index).nonzero()[:, 0]
+    pixels = index.index_select(0, rows)
+    near, far, second = (each.index_select(0, pixels) for each in (glass.flat.depth.detach(), glass.far, glass.second))
+    return GlassRays(rows, len(index), center, view.T.index_select(0, pixels), near, far, second)
 
 
 def glass_weights(
@@ -158,6 +161,6 @@ def depth_loss(bounce: FirstBounce, form: str, pixels: int) -> Tensor:
 def mesh_normal_loss(normal: Tensor, target: Tensor, where: Tensor) -> Tensor:
     """Mean over all pixels of 1 - n . N in the pixels ``where`` (H, W) bool; n of any length, N unit, (3, H, W)."""
     index = where.flatten().nonzero()[:, 0]
-    n, unit = normal.flatten(1)[:, index], target.flatten(1)[:, index]
+    n, unit = normal.flatten(1).index_select(1, index), target.flatten(1).index_select(1, index)
     cosine = (n * n.square().sum(0).clamp_min(SHORTEST_NORMAL**2).rsqrt() * unit).sum(0)
     return (1 - cosine).sum() / where.numel()
