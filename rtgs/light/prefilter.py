@@ -10,6 +10,7 @@ n and l, and the same after any axis is mirrored, so an eighth of their rows is 
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass
 from functools import cache, lru_cache
 
@@ -25,6 +26,7 @@ from rtgs.native import core
 SHARPEST, KNEE = 0.08, 0.5  # roughness of the first and of the last but one level (NVDIFFREC)
 CONE_SHARE = 0.99  # of D, summed over equal steps of the angle: what is beyond counts as 0 (NVDIFFREC)
 DIFFUSE_SIDE = 16  # of the irradiance map
+_KEPT = threading.local()
 NARROW = 0.9  # cosine of a cone from which on its texels are looked up in a tree
 
 
@@ -178,7 +180,15 @@ class _Filtered(torch.autograd.Function):
 
 
 def _apply(values: Tensor, level: Filter, *, backward: bool) -> Tensor:
-    found, spread = torch.empty(len(values), 3), np.empty((len(values), 32), dtype=np.float32)
-    given = values.contiguous().numpy()
-    core.cube_filter(*level.arrays(backward), given, spread, found.numpy(), torch.get_num_threads())
+    found, given = torch.empty(len(values), 3), values.contiguous().numpy()
+    work = _work(len(values))
+    core.cube_filter(*level.arrays(backward), given, work, found.numpy(), torch.get_num_threads())
     return found
+
+
+def _work(rows: int) -> np.ndarray:
+    """(rows, 32) numbers to work in, kept by each thread: fresh pages would cost more than the filter."""
+    kept = getattr(_KEPT, "rows", None)
+    if kept is None or len(kept) < rows:
+        kept = _KEPT.rows = np.empty((rows, 32), dtype=np.float32)
+    return kept[:rows]
