@@ -6,6 +6,7 @@ Embree finds which triangles a ray crosses; distances are then computed in float
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -70,9 +71,18 @@ class MeshGuide:
         self.merge_distance = float(merge_distance)
         self._scene = EmbreeScene(robust=True)
         self._geometry = EmbreeMesh(self._scene, mesh.vertices, mesh.faces)
-        self._normals = mesh.face_normals()
-        self._anchors = mesh.vertices[mesh.faces[:, 0]].astype(np.float64)
-        self._size = float(np.abs(mesh.vertices).max())
+
+    @cached_property
+    def _normals(self) -> np.ndarray:
+        return self.mesh.face_normals()
+
+    @cached_property
+    def _anchors(self) -> np.ndarray:
+        return self.mesh.vertices[self.mesh.faces[:, 0]].astype(np.float64)
+
+    @cached_property
+    def _size(self) -> float:
+        return float(np.abs(self.mesh.vertices).max())
 
     def surfaces(self, camera: Camera, *, back_facing: bool = False) -> SurfacePair:
         """(H, W) surfaces along the pixel rays; ``near`` and ``far`` are z-depths, ready for x = origin + z * ray.
@@ -144,11 +154,12 @@ class MeshGuide:
         answer = self._scene.run(origins.astype(np.float32), directions.astype(np.float32), output=True)
         return answer["primID"] >= 0
 
-    def distance(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """(R,) float32 distance to the first crossing in front of the origins, in lengths of the directions; inf where
-        there is none; one cast."""
-        answer = self._scene.run(origins.astype(np.float32), directions.astype(np.float32), output=True)
-        return np.where(answer["primID"] >= 0, answer["tfar"], np.inf).astype(np.float32)
+    def blocked(self, origins: np.ndarray, directions: np.ndarray, reach: float) -> np.ndarray:
+        """(R,) bool: something is in front of the origins within ``reach``, in lengths of the directions; one cast,
+        which ends at whatever it meets."""
+        far = np.full(len(origins), min(reach, float(np.finfo(np.float32).max)), np.float32)
+        rays = (origins.astype(np.float32, copy=False), directions.astype(np.float32, copy=False))
+        return self._scene.run(*rays, far, query="OCCLUDED") >= 0
 
     def nearest(self, camera: Camera) -> Tensor:
         """(H, W) float32 z-depth of the first crossing on every pixel ray, 0 where there is none; one cast."""

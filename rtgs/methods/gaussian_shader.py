@@ -124,4 +124,4 @@ def _shaded(settings: MethodSettings) -> MethodSettings:
 
 
 _HAS = frozenset({FAR_LIGHT, FORWARD})
-SPEC = MethodSpec("gaussian_shader", (StageSpec(STAGE, reads=_shaded),), build, _HAS, own=ShaderSettings)
+SPEC = MethodSpec("gaussian_shader", (StageSpec(STAGE, reads=_shaded, version=2),), build, _HAS, own=ShaderSettings)

@@ -115,7 +115,7 @@ _DIFFUSE, _LIT = cubemap_stages("smooth", "smooth_until")
 # Without MIRROR: what ablations take away there is the traced set.
 SPEC = MethodSpec(
     "ref_gaussian",
-    (_DIFFUSE, replace(_LIT, start=_reflection_start)),
+    (_DIFFUSE, replace(_LIT, start=_reflection_start, version=2)),
     build,
     has=frozenset({HARMONICS, SURFACE, FAR_LIGHT, METAL, PROPAGATION}),
     own=RefGaussianSettings,

@@ -7,6 +7,8 @@ set(RTGS_KERNELS
   gaussians/activation.cpp
   optimizer/adam.cpp
   image/mirror.cpp
+  image/split_sum.cpp
+  gaussians/mirror_light.cpp
   image/srgb.cpp
   light/lookup.cpp
   light/filter.cpp
@@ -35,6 +37,7 @@ set(RTGS_BINDINGS
   bind/activation.cpp
   bind/optimizer.cpp
   bind/mirror.cpp
+  bind/split_sum.cpp
   bind/srgb.cpp
   light/border.cpp
   bind/light.cpp

@@ -6,11 +6,15 @@ visible normals, k = (1 - omega_o . h)^5. A + B <= 1: the weight conserves energ
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from rtgs.native import core
 
 SIDE = 48  # cells of the table along cosine and width
 SAMPLES = 512  # directions of one entry
@@ -41,10 +45,42 @@ def split_sum_weight(cosine: Tensor, roughness: Tensor, reflectance: Tensor) -> 
         roughness: (P,) in 0..1, at least 0.001 counts; the width of the lobe is its square.
         reflectance: (C, P) at normal incidence.
 
-    Differentiable in all, any dtype.
+    Differentiable in all, any dtype: float32 natively, others by :func:`split_sum_weight_twin`.
     """
+    if all(each.dtype == torch.float32 for each in (cosine, roughness, reflectance)):
+        return _Weight.apply(cosine, roughness, reflectance)  # type: ignore[return-value]
+    return split_sum_weight_twin(cosine, roughness, reflectance)
+
+
+def split_sum_weight_twin(cosine: Tensor, roughness: Tensor, reflectance: Tensor) -> Tensor:
+    """:func:`split_sum_weight` in plain torch, any dtype."""
     scale, offset = split_sum_factors(cosine, roughness.clamp_min(SMALLEST_ROUGHNESS).square())
     return reflectance * scale + offset
+
+
+class _Weight(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, *given: Tensor):
+        maps = [each.detach().contiguous() for each in given]
+        weight = torch.empty_like(maps[2])
+        core.lobe_weight(*_lobes(maps), weight.numpy(), torch.get_num_threads())
+        ctx.save_for_backward(*maps)
+        return weight
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, *upstream: Tensor):
+        maps = ctx.saved_tensors
+        gradients = tuple(torch.empty_like(each) for each in maps)
+        arrays = (upstream[0].contiguous().numpy(), *(each.numpy() for each in gradients))
+        core.lobe_weight_backward(*_lobes(maps), *arrays, torch.get_num_threads())
+        return gradients
+
+
+def _lobes(maps: Sequence[Tensor]) -> tuple[object, ...]:
+    """Lobes and the table as the native core takes them."""
+    table = _table_tensor(torch.float32).numpy()
+    return (*(each.numpy() for each in maps), table, SIDE, WIDEST, SMALLEST_ROUGHNESS)
 
 
 def _place(share: Tensor) -> tuple[Tensor, Tensor]:

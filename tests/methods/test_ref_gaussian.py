@@ -237,7 +237,7 @@ def test_where_nothing_is_opaque_every_direction_is_free_and_it_is_told():
     other = new_method(settings(), made, schedule())
     other.load(method.state())
     assert [each.why for each in other.decisions if "mirror direction" in each.what] == [decision.why]
-    assert bool(part.visibility.free(torch.zeros(3, 3), torch.eye(3), torch.eye(3)).all())
+    assert bool(part.visibility.free(torch.zeros(3, 3), torch.eye(3), torch.ones(3, dtype=torch.bool)).all())
 
 
 def test_rays_are_free_unless_they_meet_the_mesh_within_reach():
@@ -248,10 +248,12 @@ def test_rays_are_free_unless_they_meet_the_mesh_within_reach():
     origins = torch.tensor([[0.0, 0, -3], [0.0, 0, -6], [0.0, 0, -3], [0, 0, -1.001], [float("nan"), 0, 0]])
     toward, up = torch.tensor([0.0, 0, 1]), torch.tensor([0.0, 1, 0])
     directions = torch.stack((toward, toward, -toward, toward, toward))
-    aside = torch.zeros(5, 3)
-    free = part.visibility.free(origins, directions, aside)
+    every = torch.ones(5, dtype=torch.bool)
+    free = part.visibility.free(origins, directions, every)
     assert free.tolist() == [0, 1, 1, 0, 1]
-    lifted = part.visibility.free(origins, directions, up.expand(5, 3))
+    assert part.visibility.free(origins, directions, torch.arange(5) > 0).tolist() == [1, 1, 1, 0, 1], "asked for four"
+    assert part.visibility.offset == 1.0
+    lifted = part.visibility.free(origins + part.visibility.offset * up, directions, every)
     assert lifted.tolist() == [1, 1, 1, 1, 1], "two voxels up is past the ball"
 
 
@@ -266,8 +268,9 @@ def test_meshes_have_one_order():
     assert np.array_equal(one.faces, other.faces)
     assert one.face_normals().sum(0) == pytest.approx(mesh.face_normals().sum(0), abs=1e-5)
     origin, direction = np.array([[0.0, 0, -3]]), np.array([[0.0, 0.02, 1]])
-    assert MeshGuide(one, 0.0).distance(origin, direction) == pytest.approx(2.0, abs=0.1)
-    assert np.isinf(MeshGuide(one, 0.0).distance(origin, -direction)).all()
+    guide = MeshGuide(one, 0.0)
+    assert [bool(guide.blocked(origin, direction, reach)[0]) for reach in (1.8, 2.2, np.inf)] == [False, True, True]
+    assert not guide.blocked(origin, -direction, np.inf).any()
 
 
 # ---- training

@@ -77,6 +77,19 @@ def _microfacet(weight: np.ndarray) -> None:
     core.microfacet_reflection(*(_floats(4) for _ in range(3)), 1e-3, 1e-3, 1.0, weight, 1)
 
 
+def _lobes(weight: np.ndarray) -> None:
+    core.lobe_weight(_floats(4), _floats(4), _floats(3, 4), _floats(2, 2, 2), 2, 1.0, 1e-3, weight, 1)
+
+
+def _mean_mirror(cosine: np.ndarray) -> None:
+    core.mean_mirror(_floats(3, 4), _floats(4), _floats(3, 4), False, 1e-6, 1e-6, _floats(4, 3), cosine, 1)
+
+
+def _mirror_light(color: np.ndarray) -> None:
+    rows = [_floats(4, 3) for _ in range(3)]
+    core.mirror_light(*rows, (0.0, 0.0, 0.0), _floats(4, 3), _floats(4, 45), color, 1)
+
+
 def _light(color: np.ndarray) -> None:
     core.cube_lookup(_floats(6 * 16, 4), _SIDES, _floats(_PIXELS, 3), _floats(0), color, 1)
 
@@ -103,6 +116,9 @@ OUTPUTS: dict[str, tuple[Callable[[np.ndarray], None], tuple[int, ...]]] = {
     "mono normal": (_normal, (3, 8, 8)),
     "mirror": (_mirror, (4,)),
     "microfacet": (_microfacet, (4,)),
+    "lobe weight": (_lobes, (3, 4)),
+    "mean mirror": (_mean_mirror, (4,)),
+    "mirror light": (_mirror_light, (4, 3)),
     "decode": (lambda out: core.srgb_decode(_floats(4), out, 1), (4,)),
     "cube lookup": (_light, (_PIXELS, 3)),
     "cube pad": (_padded, (5, 4)),

@@ -92,6 +92,15 @@ CALLS = {
     "microfacet": lambda threads: core.microfacet_reflection(
         _floats(4), _floats(4), _floats(4), 1e-3, 1e-3, 1.0, _floats(4), threads
     ),
+    "lobe weight": lambda threads: core.lobe_weight(
+        *(_floats(4) for _ in range(3)), _floats(2, 2, 2), 2, 1.0, 1e-3, _floats(4), threads
+    ),
+    "mean mirror": lambda threads: core.mean_mirror(
+        _floats(3, 4), _floats(4), _floats(3, 4), True, 1e-6, 1e-6, _floats(4, 3), _floats(4), threads
+    ),
+    "mirror light": lambda threads: core.mirror_light(
+        *(_floats(4, 3) for _ in range(3)), (0.0, 0.0, 0.0), _floats(4, 3), _floats(4, 45), _floats(4, 3), threads
+    ),
     "decode": lambda threads: core.srgb_decode(_floats(4), _floats(4), threads),
     "encode": lambda threads: core.srgb_encode(_floats(4), _floats(4), threads),
     "cube lookup": lambda threads: core.cube_lookup(

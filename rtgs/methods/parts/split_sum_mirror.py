@@ -14,7 +14,6 @@ from torch import Tensor
 from rtgs.core.decisions import Decision
 from rtgs.gaussians.channels import Channel
 from rtgs.gaussians.harmonics import SH_C0, sh_basis
-from rtgs.gaussians.primitives import unit_or_zero
 from rtgs.gaussians.surfels import ActivatedGaussians
 from rtgs.light.faces import texel_areas, texel_directions
 from rtgs.methods.parts.base import BaseSet, composited
@@ -24,12 +23,14 @@ from rtgs.methods.parts.part import Frame, Raster
 from rtgs.methods.parts.propagation import propagate_normals
 from rtgs.methods.parts.visibility import Visibility
 from rtgs.methods.plans import propagation_due
+from rtgs.methods.shading.mirror_light import REST, indirect_light
 from rtgs.methods.shading.split_sum import (
     MetalPixels,
     arriving,
     mean_normal,
     metal_pixels,
     mirrored,
+    mirrored_means,
     reflectance,
     shaded,
     specular_weight,
@@ -46,7 +47,6 @@ if TYPE_CHECKING:
 METALNESS, ROUGHNESS, ALBEDO = "metalness_logits", "roughness_logits", "albedo_logits"
 INDIRECT_DC, INDIRECT_REST = "indirect_dc", "indirect_rest"
 SH_LIMIT = 100.0  # of the coefficients of indirect light
-REST = 15  # SH functions above degree 0
 FORWARD = "forward_environment"
 
 
@@ -157,9 +157,8 @@ class SplitSumMirror(CubemapMirror):
         buffers = raster.buffers
         assert buffers.normal is not None
         pixels, alpha = metal_pixels(buffers.features.flatten(1)), buffers.alpha.flatten()
-        normal = mean_normal(buffers.normal.flatten(1), alpha, self.own.normal)
-        directions, cosine = mirrored(normal, frame.rays.directions)
-        free = self._free(frame, raster, normal, directions)
+        directions, cosine = mirrored_means(buffers.normal.flatten(1), alpha, frame.rays.directions, self.own.normal)
+        free = self._free(frame, raster, directions)
         direct = light(directions, pixels.roughness).T
         color = arriving(direct, pixels.indirect, free)
         specular = alpha * specular_weight(pixels, cosine) * color
@@ -169,17 +168,19 @@ class SplitSumMirror(CubemapMirror):
         image = shaded(pixels, specular).reshape(shape)
         return RenderedView(frame.camera, image, buffers, layers, maps, observations=raster.observations)
 
-    def _free(self, frame: Frame, raster: Raster, normal: Tensor, directions: Tensor) -> Tensor | None:
+    @torch.no_grad()
+    def _free(self, frame: Frame, raster: Raster, directions: Tensor) -> Tensor | None:
         """(P,) 1 where the mirror direction is free; None: before indirect light has begun it is everywhere."""
         if not self.indirect:
             return None
-        buffers, rays = raster.buffers, frame.rays
+        buffers, rays, offset = raster.buffers, frame.rays, self.visibility.offset
         assert buffers.depth is not None
-        with torch.no_grad():
-            origins = rays.center[:, None] + surface_depth(buffers.depth, buffers.alpha).flatten() * rays.directions
-            covered = buffers.alpha.flatten() > 0
-            free = self.visibility.free(origins.T[covered], directions[covered], normal.T[covered])
-            return torch.ones(len(covered)).masked_scatter_(covered, free)
+        assert buffers.normal is not None
+        alpha = buffers.alpha.flatten()
+        origins = rays.center[:, None] + surface_depth(buffers.depth, buffers.alpha).flatten() * rays.directions
+        if offset != 0:
+            origins = origins + offset * mean_normal(buffers.normal.flatten(1), alpha, self.own.normal)
+        return self.visibility.free(origins.T, directions, alpha > 0)
 
     def _layers(
         self, pixels: MetalPixels, specular: Tensor, color: Tensor, free: Tensor | None, shape: tuple[int, int, int]
@@ -258,19 +259,6 @@ class SplitSumMirror(CubemapMirror):
         self.forward.restore(state)
         super().restore(state)
         self.visibility.restore(state)
-
-
-def indirect_light(rows: ActivatedGaussians, center: Tensor, dc: Tensor, rest: Tensor) -> Tensor:
-    """(N, 3) max(0, SH) of each surfel along its own mirror direction, seen from ``center`` (3,) world.
-
-    Coefficients ``dc`` (N, 3) and ``rest`` (N, 45), function by function. At the centre there is no direction.
-    """
-    normal = torch.linalg.cross(rows.tangent_u, rows.tangent_v, dim=1)
-    outward = unit_or_zero(center - rows.means)
-    cosine = (normal * outward).sum(1, keepdim=True)  # the sign of the normal cancels
-    direction = 2 * cosine * normal - outward
-    basis = sh_basis(direction, 3)
-    return (SH_C0 * dc + (basis[..., None] * rest.reshape(len(rest), REST, 3)).sum(1)).clamp_min(0)
 
 
 def light_harmonics(light: DirectionalLight, side: int) -> Tensor:

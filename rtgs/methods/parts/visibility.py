@@ -74,18 +74,23 @@ class Visibility:
     def _have(self, mesh: TriangleMesh, voxel: float) -> None:
         self._guide, self._voxel = MeshGuide(mesh, 0.0), voxel
 
+    @property
+    def offset(self) -> float:
+        """How far mirror rays start along the normal, world units."""
+        return self._settings.ray_offset * self._voxel
+
     @torch.no_grad()
-    def free(self, origins: Tensor, directions: Tensor, normals: Tensor) -> Tensor:
-        """(P,) float32, 1 where a ray from ``origins`` (P, 3) along unit ``directions`` (P, 3) meets nothing of the
-        mesh within the reach, else 0. It starts ``ray_offset`` voxels along ``normals`` (P, 3)."""
+    def free(self, origins: Tensor, directions: Tensor, asked: Tensor) -> Tensor:
+        """(P,) float32, 0 where a ray from ``origins`` (P, 3) along unit ``directions`` (P, 3) meets the mesh within
+        reach, else 1; also where nobody asked: ``asked`` (P,) bool."""
         if self._guide is None:
             return torch.ones(len(origins))
-        lifted = origins + self._settings.ray_offset * self._voxel * normals
-        reach = self._settings.reach or np.inf
-        sound = torch.isfinite(lifted).all(1) & (directions.square().sum(1) > 0.5)
+        sound = asked & torch.isfinite(origins).all(1) & (directions.square().sum(1) > 0.5)
+        starts, along, there = origins.contiguous().numpy(), directions.numpy(), sound.numpy()
+        if not there.all():
+            starts, along = starts[there], along[there]
         free = np.ones(len(origins), np.float32)
-        there = sound.numpy()
-        free[there] = self._guide.distance(lifted.numpy()[there], directions.numpy()[there]) >= reach
+        free[there] = ~self._guide.blocked(starts, along, self._settings.reach or np.inf)
         return torch.from_numpy(free)
 
     # ---- state

@@ -4,7 +4,7 @@
 
 M metalness, R roughness, rho albedo, I indirect light, all as composited, A alpha; a and b of the table
 (rtgs/optics/split_sum.py) at the cosine and the width R^2; E the light, w the mirror direction, V 1 where it is free.
-Channels first, plain torch, any dtype.
+Channels first, any dtype; float32 natively where that pays.
 """
 
 from __future__ import annotations
@@ -13,7 +13,9 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
+from rtgs.native import core
 from rtgs.optics.split_sum import split_sum_weight
 
 DIELECTRIC = 0.04  # F_0 of what is no metal
@@ -37,6 +39,16 @@ def metal_pixels(features: Tensor) -> MetalPixels:
     return MetalPixels(
         features[:3], features[3], features[4], features[5:8], features[8:] if len(features) > 8 else None
     )
+
+
+def mirrored_means(normal: Tensor, alpha: Tensor, view: Tensor, form: str) -> tuple[Tensor, Tensor]:
+    """What :func:`mirrored` finds for the normals that :func:`mean_normal` makes of ``normal`` (3, P), ``alpha`` (P,).
+
+    Differentiable by both, not by ``view`` (3, P): float32 natively, other dtypes by those two.
+    """
+    if all(each.dtype == torch.float32 for each in (normal, alpha, view)):
+        return _MeanMirror.apply(normal, alpha, view, form == "unit")  # type: ignore[return-value]
+    return mirrored(mean_normal(normal, alpha, form), view)
 
 
 def mean_normal(normal: Tensor, alpha: Tensor, form: str) -> Tensor:
@@ -78,3 +90,24 @@ def arriving(direct: Tensor, indirect: Tensor | None, free: Tensor | None) -> Te
 def shaded(pixels: MetalPixels, specular: Tensor) -> Tensor:
     """(3, P) C of the part A (F_0 a + b) L (3, P)."""
     return (1 - pixels.metalness) * pixels.diffuse + specular
+
+
+class _MeanMirror(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, normal: Tensor, alpha: Tensor, view: Tensor, unit: bool):
+        maps = [each.detach().contiguous() for each in (normal, alpha, view)]
+        directions, cosine = torch.empty(len(alpha), 3), torch.empty(len(alpha))
+        ctx.save_for_backward(*maps)
+        ctx.numbers = (unit, SMALLEST_ALPHA, SHORTEST)
+        given = (*(each.numpy() for each in maps), *ctx.numbers)
+        core.mean_mirror(*given, directions.numpy(), cosine.numpy(), torch.get_num_threads())
+        return directions, cosine
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, *upstream: Tensor):
+        maps = ctx.saved_tensors
+        to_normal, to_alpha = (torch.empty_like(each) for each in maps[:2])
+        given = (*(each.numpy() for each in maps), *ctx.numbers, *(each.contiguous().numpy() for each in upstream))
+        core.mean_mirror_backward(*given, to_normal.numpy(), to_alpha.numpy(), torch.get_num_threads())
+        return to_normal, to_alpha, None, None

@@ -39,6 +39,7 @@ void bind_ellipsoids(nb::module_& m);
 void bind_image(nb::module_& m);
 void bind_optimizer(nb::module_& m);
 void bind_mirror(nb::module_& m);
+void bind_split_sum(nb::module_& m);
 void bind_srgb(nb::module_& m);
 void bind_light(nb::module_& m);
 void bind_features(nb::module_& m);

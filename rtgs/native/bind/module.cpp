@@ -16,6 +16,7 @@ NB_MODULE(_core, m) {
   rtgs::bind_surfels(m);
   rtgs::bind_optimizer(m);
   rtgs::bind_mirror(m);
+  rtgs::bind_split_sum(m);
   rtgs::bind_srgb(m);
   rtgs::bind_light(m);
   rtgs::bind_features(m);

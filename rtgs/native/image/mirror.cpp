@@ -1,39 +1,10 @@
 // Kernels of mirror.h, kLanes pixels at a time. The last group goes through buffers of whole registers.
 #include "image/mirror.h"
 
-#include "common/rows.h"
+#include "image/vectors.h"
 
 namespace rtgs::RTGS_ISA {
 namespace {
-
-struct Vector {
-  vfloat v[3];
-};
-inline vfloat dot(const Vector& a, const Vector& b) { return fma(a.v[0], b.v[0], fma(a.v[1], b.v[1], a.v[2] * b.v[2])); }
-
-inline int lanes_at(int64_t first, int64_t count) { return int(count - first < kLanes ? count - first : kLanes); }
-inline Vector load_planes(const float* p, int64_t count, int64_t first, int lanes) {  // (3, P)
-  Vector a;
-  for (int k = 0; k < 3; ++k) a.v[k] = load_first(p + k * count + first, lanes);
-  return a;
-}
-inline Vector load_vectors(const float* p, int64_t first, int lanes) {  // (P, 3)
-  Vector a;
-  if (lanes == kLanes) {
-    load_rows<3>(p + 3 * first, a.v);
-    return a;
-  }
-  float rows[3 * kLanes] = {};
-  for (int i = 0; i < 3 * lanes; ++i) rows[i] = p[3 * first + i];
-  load_rows<3>(rows, a.v);
-  return a;
-}
-inline void store_vectors(float* p, int64_t first, int lanes, const Vector& a) {
-  if (lanes == kLanes) return store_rows<3>(p + 3 * first, a.v);
-  float rows[3 * kLanes];
-  store_rows<3>(rows, a.v);
-  for (int i = 0; i < 3 * lanes; ++i) p[3 * first + i] = rows[i];
-}
 
 struct Surface {  // of kLanes pixels
   Vector view, outward, normal;  // normal: unit where the sum is long enough
