@@ -125,5 +125,15 @@ def in_order(mesh: TriangleMesh) -> TriangleMesh:
     faces = place[mesh.faces]
     first = faces.argmin(1)
     faces = np.take_along_axis(faces, (first[:, None] + np.arange(3)) % 3, 1)
-    faces = faces[np.lexsort(faces.T[::-1])]
+    faces = faces[_by_rows(faces, len(order))]
     return TriangleMesh(np.ascontiguousarray(mesh.vertices[order]), np.ascontiguousarray(faces))
+
+
+def _by_rows(faces: np.ndarray, vertices: int) -> np.ndarray:
+    """The order of faces (F, 3) by their first vertex, then their second, then their third."""
+    edges = faces[:, 0].astype(np.int64) * vertices + faces[:, 1]
+    order = np.argsort(edges, kind="stable")
+    edges = edges[order]
+    if bool((edges[1:] == edges[:-1]).any()):  # two faces share an edge in the same direction
+        return np.lexsort(faces.T[::-1])
+    return order
