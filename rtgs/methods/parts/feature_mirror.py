@@ -134,13 +134,18 @@ class FeatureMirror(Part):
         inside = flat[11].detach() if scoped else alpha
         outside = (alpha.detach() - inside).clamp_min(0) if scoped else torch.zeros_like(alpha.detach())
         chosen = torch.nonzero(inside.detach() > LEAST_INSIDE)[:, 0]
-        normal, view = buffers.normal.flatten(1)[:, chosen], frame.rays.directions[:, chosen]
+        every = len(chosen) == flat.shape[1]
+        normal, view, own = (
+            each if every else each.index_select(1, chosen)
+            for each in (buffers.normal.flatten(1), frame.rays.directions, flat[3:11])
+        )
         rays = mirror_directions(normal, frame.rays.center, view)
-        albedo, roughness, feature = flat[3:6, chosen], flat[6, chosen], flat[7:11, chosen]
+        albedo, roughness, feature = own[:3], own[3], own[4:]
         level = roughness if self._own.roughness_levels else torch.zeros_like(roughness)
         found = light.linear(rays.directions, level, feature.T).T
         shape = (3, camera.height, camera.width)
-        shown = torch.zeros_like(flat[:3]).index_copy(1, chosen, encoded(albedo + found, "linear"))
+        lit = encoded(albedo + found, "linear")
+        shown = lit if every else torch.zeros_like(flat[:3]).index_copy(1, chosen, lit)
         colors = flat[:3] if scoped or pending else flat[:3].detach()
         background = torch.tensor(self.settings.render.background)[:, None]
         clear = (1 - alpha) * background  # in ``colors`` already, and seen beside both shares
