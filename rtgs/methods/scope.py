@@ -25,16 +25,16 @@ _STATE = "scope"  # (4,) float64 centre and radius
 class ScopeSettings:
     """Keys ``method.own.<name>`` of methods with a scope."""
 
-    # masks: around what they show, where the scene has none there is no scope; specular: around the pixels that turn
-    # out specular in training, none where they are too few
+    # masks: around what they show, none where the scene has none
+    # specular: around the pixels that turn out specular in training, none where they are too few
     scope: Literal["sphere", "masks", "specular"] = "sphere"
     scope_radius: float = 0.0  # world units, of the sphere; 0: no scope
     scope_center: tuple[float, ...] = (0.0, 0.0, 0.0)  # world
-    # These of scope=specular alone. After this share of the second stage the training views are looked at, once; where
-    # opacities are reset, right before the next reset.
+    # of scope=specular: the share of the second stage after which the training views are looked at, once
+    # where opacities are reset, right before the next reset
     scope_at: float = 0.3
-    scope_specular: float = 0.3  # from this on a pixel is specular
-    scope_share: float = 0.002  # of the training views' pixels must be; that of method.reflection.matte
+    scope_specular: float = 0.3  # of scope=specular: from this on a pixel is specular
+    scope_share: float = 0.002  # of the training views' pixels must be, as of method.reflection.matte
     scope_margin: float = 1.1  # times the radius of what is found
 
     def __post_init__(self) -> None:
