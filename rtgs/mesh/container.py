@@ -271,7 +271,8 @@ class ObjectGuide:
         self._counts: dict[tuple[object, ...], tuple[int, int]] = {}
 
     def surfaces(self, camera: Camera) -> ObjectSurfaces:
-        """First and second surface along the camera's pixel rays. A pane has no second surface."""
+        """First and second surface along the camera's pixel rays; not to be written into: asked again, they are the
+        same tensors. A pane has no second surface."""
         key = camera_key(camera)
         if self._last is not None and self._last[0] == key:
             return self._last[1]

@@ -93,10 +93,12 @@ def scope_term(base: BaseSet, own: DeferredSettings, held: ScopeHolder) -> LossT
     return LossTerm("outside", own.outside, outside)
 
 
+_DIFFUSE, _LIT = cubemap_stages("primitive")
+
 # Without MIRROR: what ablations take away there is the traced set.
 SPEC = MethodSpec(
     "3dgs_dr",
-    cubemap_stages("primitive"),
+    (_DIFFUSE, replace(_LIT, version=2)),
     build,
     frozenset({HARMONICS, FAR_LIGHT, PROPAGATION, SABOTAGE}),
     own=DeferredSettings,

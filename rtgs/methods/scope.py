@@ -44,7 +44,8 @@ class ScopeSettings:
         refuse_outside(self, "method.own", 0, 1, "scope_at", "scope_specular", "scope_share", open_low=True)
         refuse_outside(self, "method.own", 0, math.inf, "scope_margin", open_low=True)
         if self.scope != "sphere":
-            beside = f"with method.own.scope={self.scope}, which finds the sphere"
+            typed = "method.own.scope_radius=0 'method.own.scope_center=[0,0,0]' take away one that a scene's file has"
+            beside = f"with method.own.scope={self.scope}, which finds the sphere; {typed}"
             refuse_unless(self.scope_radius == 0, "method.own.scope_radius", self.scope_radius, f"0 {beside}")
             center = list(self.scope_center)
             refuse_unless(not any(center), "method.own.scope_center", center, f"[0, 0, 0] {beside}")

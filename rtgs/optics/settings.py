@@ -79,7 +79,7 @@ class WallSettings:
     openings: float = field(default=0.0, metadata=UNLESS_DEFAULT)
     opening_gain: float = field(default=0.005, metadata=UNLESS_DEFAULT)  # fall of the squared error there, at least
     # In training neighbours whose wall reflects less than this share one ray for what it mirrors, and one for what is
-    # mirrored inside behind it; 0: each pixel has rays of its own.
+    # mirrored inside behind it; 0: each pixel has rays of its own. The reflectance counts times the learned k_s.
     shared_below: float = field(default=0.0, metadata=UNLESS_DEFAULT)
     cover: float = 0.9  # a composited k_s from which on a pixel is all glass: what L_spec asks of the interface
 

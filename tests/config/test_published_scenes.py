@@ -18,6 +18,7 @@ from pipelines.publishing.against_paper import keys_of
 from rtgs.config import RunConfig, compose
 from rtgs.config.locate import choices_of, conf_dir
 from rtgs.config.provenance import settings_of
+from rtgs.core.errors import RtgsError
 from rtgs.methods import find_method
 from rtgs.methods.plans import reflection_plan
 from rtgs.train.schedule import loss_start
@@ -160,3 +161,13 @@ def test_runs_on_the_papers_captures_are_compared_with_the_numbers_of_the_captur
     assert "schedule.total is 2000 instead of 97000" in short
     row = "3dgs_dr, no_normal_guide"  # which is off in the published recipe
     assert "schedule.total is 2000 instead of 97000" in keys_of(composed("3dgs_dr", "ref_real/sedan", "quick"), row)
+
+
+def test_a_scope_that_is_found_takes_the_place_of_a_published_sphere_once_that_is_taken_away():
+    chosen = ("3dgs_dr", "ref_real/sedan", "paper", "method.own.scope=masks")
+    assert composed(*chosen[:3]).method.own["scope_radius"] > 0
+    remedy = r"method\.own\.scope_radius=0 'method\.own\.scope_center=\[0,0,0\]'"
+    with pytest.raises(RtgsError, match=f"scope_radius.*{remedy}"):
+        composed(*chosen)
+    found = composed(*chosen, "method.own.scope_radius=0", "method.own.scope_center=[0,0,0]")
+    assert found.method.own["scope"] == "masks"
