@@ -98,6 +98,8 @@ def _text(path: Path, most: int) -> str:
 
 
 def _reason(error: Exception) -> DocumentError:
+    if "nesting depth" in str(error):  # libyaml's own limit, met where its scanner looks ahead
+        return DocumentError(f"it is nested more than {DEPTH} levels deep")
     return error if isinstance(error, DocumentError) else DocumentError(_shortened(" ".join(str(error).split())))
 
 
