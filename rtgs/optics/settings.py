@@ -78,9 +78,6 @@ class WallSettings:
     # openings, as that of a cup (docs/glass_light.md). 0: all are walls.
     openings: float = field(default=0.0, metadata=UNLESS_DEFAULT)
     opening_gain: float = field(default=0.005, metadata=UNLESS_DEFAULT)  # fall of the squared error there, at least
-    # In training neighbours whose wall reflects less than this share one ray for what it mirrors, and one for what is
-    # mirrored inside behind it; 0: each pixel has rays of its own. The reflectance counts times the learned k_s.
-    shared_below: float = field(default=0.0, metadata=UNLESS_DEFAULT)
     cover: float = 0.9  # a composited k_s from which on a pixel is all glass: what L_spec asks of the interface
 
     def __post_init__(self) -> None:
@@ -99,6 +96,4 @@ class WallSettings:
         )
         key = "method.transmittance.wall.opening_gain"
         refuse_unless(self.opening_gain < 1, key, self.opening_gain, "below 1: no error falls by more")
-        key = "method.transmittance.wall.shared_below"
-        refuse_unless(self.shared_below <= 1, key, self.shared_below, "at most 1: no wall reflects more")
         refuse_unless(0 < self.cover <= 1, "method.transmittance.wall.cover", self.cover, "above 0 and at most 1")

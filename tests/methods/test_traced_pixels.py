@@ -97,21 +97,3 @@ def test_no_pixels_share_no_rays():
     nothing = torch.empty(0, dtype=torch.int64)
     shared = share_rays(nothing.bool(), nothing, nothing)
     assert len(shared.own) == len(shared.ray) == 0
-
-
-def test_pixels_apart_share_rays_with_each_other_alone_whatever_the_border():
-    generator = torch.Generator().manual_seed(0)
-    showing, apart = torch.full((24, 32), torch.inf), torch.rand(24, 32, generator=generator) > 0.5
-    surface = torch.rand(24, 32, generator=generator) > 0.1
-    order = tile_order(32, 24, 16)
-    quad_of = torch.empty(24 * 32, dtype=torch.int64).scatter_(0, order.index, order.quad)
-    for below in (0.0, 0.5):
-        settings = TracedShareSettings(shared_below=below, tile=16)
-        chosen = choose_pixels(surface, showing, settings, generator, apart)
-        assert chosen.shared is not None
-        own = apart.flatten()[chosen.index]
-        sender = chosen.index[chosen.shared.own][chosen.shared.ray]
-        assert torch.equal(sender[~own], chosen.index[~own])
-        assert bool(apart.flatten()[sender[own]].all())
-        assert torch.equal(quad_of[sender], quad_of[chosen.index])
-        assert len(sender[own].unique()) == len(quad_of[chosen.index[own]].unique())

@@ -214,8 +214,7 @@ class Glass(Part):
         flat = mirror.surface(raster.buffers)
         bend = None if self.vertices is None else self.vertices.bend(frame.step)
         glass = self.pixels(frame, flat, bend)
-        apart = None if self.wall is None else self.wall.sharing(frame, glass)
-        chosen = mirror.choose(frame, raster.buffers, glass.flat, always=glass.inside, apart=apart)
+        chosen = mirror.choose(frame, raster.buffers, glass.flat, always=glass.inside)
         straight = glass_rays(glass, chosen.index, rays.center, rays.directions)
         if self.wall is not None:
             self.wall.set_for(frame.step if frame.training and frame.step < self.plan.judged else None)
@@ -243,7 +242,7 @@ class Glass(Part):
         """What one ray of each kind meets behind each traced pixel, and the lights of it; ``scatter``: rough walls."""
         frame, chosen, rays = shown.frame, shown.chosen, shown.rays
         pixels = chosen.index[rays.rows]
-        inner = None if self.wall is None else self.wall.inner_rays(frame, rays, pixels, self.generator)
+        inner = None if self.wall is None else self.wall.inner_rays(frame.camera, rays, pixels)
         if inner is not None and shown.bend is not None:
             inner = replace(inner, paths=bent_paths(inner.paths, shown.bend))
         leaving = None if inner is None else inner.leaving(scatter)
@@ -272,7 +271,8 @@ class Glass(Part):
         surfaces = centers if self.wall is None else self.wall.surfaces(frame.camera)
         if bend is not None and self.vertices is not None:
             surfaces = self.vertices.moved(frame.camera, surfaces, bend)
-        made = object_pixels(self.settings.transmittance, frame, flat, surfaces, centers.hit, self.on_glass(surfaces))
+        known = self.on_glass(surfaces)
+        made = object_pixels(self.settings.transmittance, frame, flat, surfaces, centers.hit, known)
         return made if self.wall is None else self.wall.on_glass(made, frame.camera)
 
     def on_glass(self, surfaces: ObjectSurfaces) -> Tensor:

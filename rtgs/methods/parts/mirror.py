@@ -207,26 +207,20 @@ class Mirror(Part):
 
     @torch.no_grad()
     def choose(
-        self,
-        frame: Frame,
-        buffers: RasterBuffers,
-        flat: SurfacePixels,
-        always: Tensor | None = None,
-        apart: Tensor | None = None,
+        self, frame: Frame, buffers: RasterBuffers, flat: SurfacePixels, always: Tensor | None = None
     ) -> TracedPixels:
-        """Which pixels are traced, which of them share a ray; ``always`` (H * W,) bool: each by a ray of its own, but
-        for those in ``apart`` (H * W,), which share rays with each other."""
+        """Which pixels are traced, which of them share a ray; ``always`` (H * W,) bool: each by a ray of its own."""
         settings, traced = self.settings.reflection, self.settings.reflection.traced
         if not frame.training or frame.step < self.plan.judged:  # k_s has to tell the mirrors from the rest first
             traced = replace(traced, shared_below=0.0)
         there = surface_there(flat, buffers.alpha.flatten(), settings.smallest_alpha)
         showing = None
-        if traced.threshold > 0 or traced.shared_below > 0 or apart is not None:
+        if traced.threshold > 0 or traced.shared_below > 0:
             showing = showing_reflection(flat, frame.rays.directions, self.settings.optics)
             showing = showing if always is None else showing.masked_fill(always, torch.inf)
             showing = showing.reshape(buffers.alpha.shape)
         generator = self.generator if frame.training else None
-        return choose_pixels(there.reshape(buffers.alpha.shape), showing, traced, generator, apart)
+        return choose_pixels(there.reshape(buffers.alpha.shape), showing, traced, generator)
 
     def reflect(
         self,

@@ -27,7 +27,7 @@ class FarWall:
     """The wall behind the contents, where it is mirrored light's turning point."""
 
     inner: InnerRays | None  # None: no ray of this view is mirrored there
-    surroundings: Tensor | None  # (M', 3) encoded colours that the traced leaving rays met
+    surroundings: Tensor | None  # (M, 3) encoded colours that the leaving rays met
     index: Tensor | float  # of refraction
     tint: Tensor | None = None  # (3,) of light that passes; None: none
 
@@ -124,15 +124,13 @@ class StraightRays:
         assert wall.surroundings is not None
         legs = wall.inner.paths.legs
         origins, directions, lengths = (
-            wall.inner.traced(torch.cat([getattr(leg, name) for leg in legs]))
-            for name in ("origin", "direction", "length")
+            torch.cat([getattr(leg, name) for leg in legs]) for name in ("origin", "direction", "length")
         )
         start = self.settings.transmittance.offset * self.base.extent
         options = self._options(start, lengths.clamp_min(2 * start), self.own_degree, False)
         inside, _ = self.own.trace(origins, directions, options, watched=False)
         assert inside.colors is not None
-        met = (inside.colors, inside.alpha, wall.surroundings)
-        values = (wall.inner.by_leg(wall.inner.every(each)) for each in met)
+        values = (wall.inner.by_leg(each) for each in (inside.colors, inside.alpha, wall.surroundings))
         return [TracedLeg(*each) for each in zip(*values, strict=True)]
 
     def _rasterized(

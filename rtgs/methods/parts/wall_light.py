@@ -17,11 +17,9 @@ from rtgs.mesh.container import ObjectGuide, ObjectSurfaces
 from rtgs.mesh.coverage import CoverageGuide
 from rtgs.mesh.inner_paths import InnerGuide, InnerPaths
 from rtgs.methods.parts.openings import Openings, judged_openings, upward_parts
-from rtgs.methods.parts.part import Frame
 from rtgs.methods.parts.rough_walls import Scatter
 from rtgs.methods.shading.outline import Outline, covering
 from rtgs.methods.shading.straight import GlassPixels, GlassRays
-from rtgs.methods.shading.traced_pixels import SharedRays, share_rays
 from rtgs.optics.dielectric import passed, wall_reflectance
 from rtgs.optics.settings import WallSettings
 from rtgs.train.parameters import ParameterGroup, Rate
@@ -40,18 +38,9 @@ class InnerRays:
 
     rows: Tensor  # (K,) int64 into the straight rays
     paths: InnerPaths
-    shared: SharedRays | None = None  # of the M stretches of all legs; None: each has a ray of its own
-
-    def traced(self, values: Tensor) -> Tensor:
-        """(M', ...) of values (M, ...): those whose rays are traced."""
-        return values if self.shared is None else values[self.shared.own]
-
-    def every(self, values: Tensor) -> Tensor:
-        """(M, ...) of what the traced rays met (M', ...)."""
-        return values if self.shared is None else values.index_select(0, self.shared.ray)
 
     def leaving(self, scatter: Scatter | None = None) -> tuple[Tensor, Tensor]:
-        """(M', 3) origins and directions of the traced rays that leave the object, leg after leg."""
+        """(M, 3) origins and directions of the rays that leave the object, leg after leg."""
         legs = self.paths.legs
         directions = [leg.direction for leg in legs]
         if scatter is not None:
@@ -59,22 +48,7 @@ class InnerRays:
             for number, leg in enumerate(legs):
                 pixels = pixels[leg.parent]
                 directions[number] = scatter.leaving(leg.direction, pixels, number + 1)
-        return self.traced(torch.cat([leg.exit for leg in legs])), self.traced(torch.cat(directions))
-
-    def share(self, index: float, below: float, width: int, turn: int) -> InnerRays:
-        """The same, with one ray for the pixels of a 2x2 block whose far wall reflects less than ``below``; ``turn``
-        0 .. 3: whose it is."""
-        pixels, sharing = self.paths.pixels, wall_reflectance(self.paths.cosine, index) < below
-        own, ray, traced, before = [], [], 0, 0
-        for leg in self.paths.legs:
-            pixels, sharing = pixels[leg.parent], sharing[leg.parent]
-            y, x = pixels // width, pixels % width
-            quad, corner = y // 2 * (width // 2 + 1) + x // 2, y % 2 * 2 + x % 2
-            found = share_rays(sharing, quad, (corner + turn) % 4)
-            own.append(found.own + before)
-            ray.append(found.ray + traced)
-            traced, before = traced + len(found.own), before + len(pixels)
-        return replace(self, shared=SharedRays(torch.cat(own), torch.cat(ray)))
+        return torch.cat([leg.exit for leg in legs]), torch.cat(directions)
 
     def by_leg(self, values: Tensor) -> tuple[Tensor, ...]:
         """(M, ...) values of all legs, leg by leg."""
@@ -292,37 +266,15 @@ class WallLight:
         if width == 0:
             return [None]
         numbers = range(self.settings.rough_samples) if step is None else (step,)
-        return [Scatter(width, self._index_now(), number) for number in numbers]
+        index = float(torch.as_tensor(self.index).detach())
+        return [Scatter(width, index, number) for number in numbers]
 
-    def inner_rays(self, frame: Frame, rays: GlassRays, pixels: Tensor, generator: torch.Generator) -> InnerRays | None:
-        """Behind the straight ``rays``, which go through these flattened ``pixels`` (R,); None: there are none.
-        ``generator`` draws whose ray is traced where some share one."""
+    def inner_rays(self, camera: Camera, rays: GlassRays, pixels: Tensor) -> InnerRays | None:
+        """Behind the straight ``rays``, which go through these flattened ``pixels`` (R,); None: there are none."""
         if self._inner is None:
             return None
-        rows, paths = self._inner.paths(frame.camera, self._guide).take(pixels)
-        found = InnerRays(rows, paths) if len(rows) else None
-        if found is None or not self._shares(frame):
-            return found
-        turn = int(torch.randint(4, (), generator=generator))
-        return found.share(self._index_now(), self.settings.shared_below, frame.camera.width, turn)
-
-    def _shares(self, frame: Frame) -> bool:
-        return frame.training and self.settings.shared_below > 0
-
-    def _index_now(self) -> float:
-        return float(torch.as_tensor(self.index).detach())
-
-    @torch.no_grad()
-    def sharing(self, frame: Frame, glass: GlassPixels) -> Tensor | None:
-        """(H * W,) bool: pixels of glass that show so little of what they mirror that neighbours share a ray; None:
-        there are none."""
-        if not self._shares(frame):
-            return None
-        rows = (glass.known & glass.inside).nonzero()[:, 0]
-        normal, along = (each.index_select(1, rows) for each in (glass.flat.normal, frame.rays.directions))
-        cosine = -(normal * along).sum(0) / (normal.square().sum(0) * along.square().sum(0)).sqrt().clamp_min(1e-9)
-        shown = glass.flat.specular[rows] * wall_reflectance(cosine, self._index_now())
-        return torch.zeros_like(glass.inside).index_copy(0, rows, shown < self.settings.shared_below)
+        rows, paths = self._inner.paths(camera, self._guide).take(pixels)
+        return InnerRays(rows, paths) if len(rows) else None
 
 
 def walls_of(

@@ -56,11 +56,7 @@ def tile_order(width: int, height: int, tile: int) -> TileOrder:
 
 
 def choose_pixels(
-    surface: Tensor,
-    showing: Tensor | None,
-    settings: TracedShareSettings,
-    generator: torch.Generator | None,
-    apart: Tensor | None = None,
+    surface: Tensor, showing: Tensor | None, settings: TracedShareSettings, generator: torch.Generator | None
 ) -> TracedPixels:
     """The pixels to trace.
 
@@ -71,8 +67,6 @@ def choose_pixels(
         settings: threshold, share, side of the tiles; which pixels share rays.
         generator: draws the tiles in which the rest is traced as well, and whose ray is shared; None (no training): the
             rest is left out, and no ray is shared.
-        apart: (H, W) bool: pixels that share rays with each other, whatever they show, and with no others; None: there
-            are none.
     """
     height, width = surface.shape
     order = tile_order(width, height, settings.tile)
@@ -90,13 +84,10 @@ def choose_pixels(
     index, emphasis, shared = order.index.index_select(0, chosen), None, None
     if settings.threshold > 0:
         emphasis = torch.where(high.index_select(0, chosen), 1.0, 1 / settings.share)
-    if settings.shared_below > 0 or apart is not None:
+    if settings.shared_below > 0:
         turn = (order.corner.index_select(0, chosen) + int(torch.randint(4, (), generator=generator))) % 4
-        sharing, quad = shown.index_select(0, chosen) < settings.shared_below, order.quad.index_select(0, chosen)
-        if apart is not None:
-            own = apart.flatten().index_select(0, index)
-            sharing, quad = sharing | own, 2 * quad + own
-        shared = share_rays(sharing, quad, turn)
+        sharing = shown.index_select(0, chosen) < settings.shared_below
+        shared = share_rays(sharing, order.quad.index_select(0, chosen), turn)
     return TracedPixels(index, emphasis, shared)
 
 
