@@ -7,11 +7,10 @@ import re
 import textwrap
 from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import Any
 
 from rtgs.config import RunConfig, compose
 from rtgs.config.explain import close_keys
-from rtgs.config.keys import Key, config_keys, own_keys, sentence_of, words_of_value
+from rtgs.config.keys import Key, config_keys, own_keys, sentence_of, value_of, words_of_value
 from rtgs.config.locate import project_root
 from rtgs.config.opened import OPTIONS, friendly_words, split_config_dir, with_configs
 from rtgs.config.provenance import settings_of
@@ -55,12 +54,8 @@ def explain(words: Sequence[str]) -> int:
 
 def keys_of(config: RunConfig) -> dict[str, Key]:
     """Every key of a run: those of all runs, and in the place of ``method.own`` those of its method's own settings."""
-    own = own_keys(_own(config))
+    own = own_keys(find_method(config.method.name).own_settings(config.method))
     return {name: key for name, key in config_keys().items() if not own or name != "method.own"} | own
-
-
-def _own(config: RunConfig) -> Any:
-    return find_method(config.method.name).own_settings(config.method)
 
 
 def one_key(key: Key, config: RunConfig, words: Sequence[str]) -> str:
@@ -129,13 +124,3 @@ def _advice(name: str) -> str:
 def _brief(value: object) -> str:
     text = redact(str(value))
     return text if len(text) <= 60 else f"{text[:57]}..."
-
-
-def value_of(config: RunConfig, name: str) -> object:
-    """The value at a dotted name."""
-    value: object = config
-    if name.startswith("method.own."):
-        value, name = _own(config), name.removeprefix("method.own.")
-    for part in name.split("."):
-        value = getattr(value, part)
-    return value
