@@ -5,13 +5,12 @@ from __future__ import annotations
 import inspect
 import re
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import Any
 
 from rtgs.config import RunConfig, compose
 from rtgs.config.explain import close_keys
-from rtgs.config.keys import Key, config_keys, own_keys, sentence_of, words_of_value
+from rtgs.config.keys import Key, config_keys, own_keys, sentence_of, value_of, words_of_value
 from rtgs.config.locate import project_root
 from rtgs.config.opened import OPTIONS, friendly_words, split_config_dir, with_configs
 from rtgs.config.provenance import settings_of
@@ -55,18 +54,14 @@ def explain(words: Sequence[str]) -> int:
 
 def keys_of(config: RunConfig) -> dict[str, Key]:
     """Every key of a run: those of all runs, and in the place of ``method.own`` those of its method's own settings."""
-    own = own_keys(_own(config))
+    own = own_keys(find_method(config.method.name).own_settings(config.method))
     return {name: key for name, key in config_keys().items() if not own or name != "method.own"} | own
-
-
-def _own(config: RunConfig) -> Any:
-    return find_method(config.method.name).own_settings(config.method)
 
 
 def one_key(key: Key, config: RunConfig, words: Sequence[str]) -> str:
     """All that is known of a key in the run of these words."""
     rows = [("value", redact(str(value_of(config, key.name))))]
-    rows.append(("set in", _set_in(key.name, words)))
+    rows.append(("set in", _set_in((key.name,), keys_of(config), words)))
     source = Path(inspect.getfile(key.owner)).resolve()
     if source.is_relative_to(project_root()):  # not of a method from outside
         source = source.relative_to(project_root())
@@ -80,42 +75,52 @@ def one_key(key: Key, config: RunConfig, words: Sequence[str]) -> str:
     return "\n".join(lines)
 
 
-def _set_in(name: str, words: Sequence[str]) -> str:
-    """The last place that sets a key, and what it went over; where that place takes another key's value, also those of
-    the other key."""
-    settings = settings_of(name, words)
+def _set_in(chain: tuple[str, ...], keys: Collection[str], words: Sequence[str]) -> str:
+    """The last place that sets the last key of a chain, and what it went over; where that place takes another key's
+    value, also those of the other key. The keys before it in the chain are those that led to it.
+
+    Raises:
+        RtgsError: a key takes the value of one that does not exist, or in the end its own.
+    """
+    settings = settings_of(chain[-1], words)
     if not settings:
         return _NOWHERE
     *before, last = settings
     over = ", ".join(f"{each.place}: {redact(each.text)}" for each in reversed(before))
     place = f"{last.place} (before it {over})" if over else last.place
-    other = re.fullmatch(r"\$\{([a-z_0-9.]+)\}", last.text)
-    if other is None:
+    taken = re.fullmatch(r"\$\{([a-z_0-9.]+)\}", last.text)
+    if taken is None:
         return place
-    where = _set_in(other[1], words)
-    return f"{place}, which takes {other[1]}, set {where if where == _NOWHERE else f'in {where}'}"
+    other = taken[1]
+    _refuse_taken(other, chain, keys, f"rtgs explain: {chain[-1]} is {last.text} ({last.place})")
+    where = _set_in((*chain, other), keys, words)
+    return f"{place}, which takes {other}, set {where if where == _NOWHERE else f'in {where}'}"
+
+
+def _refuse_taken(other: str, chain: tuple[str, ...], keys: Collection[str], said: str) -> None:
+    """A key takes the value of ``other``, which has to be one, and none that leads back."""
+    if other in chain:
+        ring = " -> ".join((*chain[chain.index(other) :], other))
+        raise RtgsError(f"{said}, which leads back to itself: {ring}; give one of them a value")
+    # A key may hold keys of its own: tables by name.
+    if not any(key == other or key.startswith(f"{other}.") or other.startswith(f"{key}.") for key in keys):
+        raise RtgsError(f"{said}, but there is no key {other!r}; {_advice(other)}")
 
 
 def _listed(name: str, config: RunConfig) -> str:
     """Every key below a dotted name, with its value."""
     below = [key for key in keys_of(config) if not name or key.startswith(f"{name}.")]
     if not below:
-        close = close_keys(name.rpartition(".")[2])
-        advice = f"did you mean {' or '.join(close)}?" if close else "`rtgs explain` lists all keys"
-        raise RtgsError(f"rtgs explain: there is no key {name!r}; {advice}")
+        raise RtgsError(f"rtgs explain: there is no key {name!r}; {_advice(name)}")
     return columns([("key", "value"), *((key, _brief(value_of(config, key))) for key in below)])
+
+
+def _advice(name: str) -> str:
+    """What may be meant by a name that is no key."""
+    close = close_keys(name.rpartition(".")[2])
+    return f"did you mean {' or '.join(close)}?" if close else "`rtgs explain` lists all keys"
 
 
 def _brief(value: object) -> str:
     text = redact(str(value))
     return text if len(text) <= 60 else f"{text[:57]}..."
-
-
-def value_of(config: RunConfig, name: str) -> object:
-    """The value at a dotted name."""
-    value: object = config
-    if name.startswith("method.own."):
-        value, name = _own(config), name.removeprefix("method.own.")
-    for part in name.split("."):
-        value = getattr(value, part)
-    return value

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 
 from omegaconf import DictConfig
@@ -11,6 +12,7 @@ from rtgs.config.opened import opened_configs
 from rtgs.config.schema import Choices, RunConfig, register_schema
 from rtgs.core.build import build
 from rtgs.core.credentials import redact
+from rtgs.core.errors import RtgsError
 from rtgs.methods.settings import MethodSettings
 from rtgs.train.settings import ScheduleSettings
 
@@ -75,13 +77,39 @@ def choices_from(groups: Mapping[str, object], overrides: Sequence[str]) -> Choi
 
     Where a run is tracked and who looks at it is no part of what it is: these words are left out, and credentials
     with them.
+
+    Raises:
+        RtgsError: ``${...}`` in an override has no value.
     """
     names = {str(key): str(value) for key, value in groups.items() if value is not None}
     chosen = {key: names.get(key, "") for key in ("method", "preset", "ablation", "experiment")}
     told_otherwise = {*names, "hydra", "paths.root", "name", "threads", "view"} - {"sfm", "masks", "normals", "judge"}
     elsewhere = ("tracking.", "viewer.")
-    keys = [item for item in overrides if _key(item) not in told_otherwise and not _key(item).startswith(elsewhere)]
+    keys = [
+        item
+        for item in _resolved(overrides)
+        if _key(item) not in told_otherwise and not _key(item).startswith(elsewhere)
+    ]
     return Choices(**chosen, scene_file=names.get("scene", ""), overrides=tuple(map(redact, keys)))
+
+
+def _resolved(overrides: Sequence[str]) -> list[str]:
+    """The overrides with the values that ``${...}`` in them stands for; Hydra's own list finds them as it is read."""
+    from omegaconf import ListConfig
+    from omegaconf.errors import OmegaConfBaseException
+
+    found = []
+    for index in range(len(overrides)):
+        try:
+            found.append(str(overrides[index]))
+        except OmegaConfBaseException as error:
+            word = str(overrides._get_node(index)) if isinstance(overrides, ListConfig) else ""
+            taken = " and ".join(re.findall(r"\$\{[\w.]+\}", word))  # not all of the value: it may hold a password
+            raise RtgsError(
+                f"config: {_key(word)} on the command line takes {taken or 'what is not there'}: "
+                f"{str(error).splitlines()[0]}; give a value, or ${{KEY}} of a key that has a value of its own"
+            ) from error
+    return found
 
 
 def _key(override: str) -> str:

@@ -8,19 +8,23 @@ from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 
+import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from rtgs.config.locate import choices_of
+from rtgs.config.keys import value_of
+from rtgs.config.locate import choices_of, conf_dir
 from rtgs.config.names import derive_name, run_name
 from rtgs.config.schema import Choices, RunConfig
 from rtgs.config.words import FOLDER_CHOICE, quoted
 from rtgs.core.build import build
 from rtgs.core.credentials import ADDRESSES, hide
+from rtgs.core.documents import load_yaml
 from rtgs.core.errors import RtgsError
 from rtgs.methods import find_method, own_methods
 from rtgs.methods.settings import MethodSettings
 from rtgs.methods.spec import FEATURES
+from rtgs.workflow.fingerprint import flatten
 
 
 def hide_credentials(composed: DictConfig) -> None:
@@ -105,7 +109,7 @@ def _refuse_idle_ablation(config: RunConfig, choices: Choices) -> None:
     """An ablation is for methods that have what it takes away, with presets that have it on.
 
     Raises:
-        RtgsError: the method has not, or it is off.
+        RtgsError: the method has not, it is off, or words go over all of it.
     """
     needs = set(config.ablation.needs)
     if unknown := sorted(needs - set(FEATURES)):
@@ -120,11 +124,49 @@ def _refuse_idle_ablation(config: RunConfig, choices: Choices) -> None:
             f"config: ablation={choices.ablation} takes nothing away from method {config.method.name}, which has no "
             f"{', '.join(lacking)}: it is for {fit}"
         )
-    if choices.preset in config.ablation.idle_with:
-        fit = ", ".join(name for name in choices_of("preset") if name not in config.ablation.idle_with)
+    _refuse_off(config, choices)
+    _refuse_overridden(choices)
+
+
+def _refuse_off(config: RunConfig, choices: Choices) -> None:
+    """``ablation.idle_with``: presets, and ``key=value`` where a value has it off, whoever set that."""
+    idle_with = config.ablation.idle_with
+    said = f"config: ablation={choices.ablation} takes nothing away from method {config.method.name} with"
+    if choices.preset in idle_with:
+        fit = ", ".join(name for name in choices_of("preset") if name not in idle_with)
+        raise RtgsError(f"{said} preset={choices.preset}, where it is off already: it is for preset {fit}")
+    for key, _, text in (each.partition("=") for each in idle_with if "=" in each):
+        try:
+            value = value_of(config, key)
+        except AttributeError as error:
+            raise RtgsError(
+                f"config: ablation.idle_with of ablation={choices.ablation} names {key}, which is no key of method "
+                f"{config.method.name}: write KEY=VALUE of a key that `rtgs explain` lists, or a preset"
+            ) from error
+        if value == yaml.safe_load(text):
+            raise RtgsError(
+                f"{said} {key}={value}, where it is off already: leave the ablation out, or give {key} another value "
+                f"(`rtgs explain {key}` says where it is set)"
+            )
+
+
+def _refuse_overridden(choices: Choices) -> None:
+    """Words go over files: where they set all that an ablation sets, it changes nothing, whatever the values are.
+
+    Of ablations of ``conf/``; those of a folder of one's own are not looked up.
+    """
+    file = conf_dir() / "ablation" / f"{choices.ablation}.yaml"
+    if choices.ablation in ("", "none") or not file.is_file():
+        return
+    words = {word: word.partition("=")[0].lstrip("+~") for word in choices.overrides}
+    content = {group: values for group, values in load_yaml(file).items() if group not in ("ablation", "defaults")}
+    keys = list(flatten(content))
+    over = {word: [key for key in keys if f"{key}.".startswith(f"{name}.")] for word, name in words.items()}
+    if keys and set(keys) == {key for found in over.values() for key in found}:
+        said = " ".join(word for word, found in over.items() if found)
         raise RtgsError(
-            f"config: ablation={choices.ablation} takes nothing away from method {config.method.name} with "
-            f"preset={choices.preset}, where it is off already: it is for preset {fit}"
+            f"config: ablation={choices.ablation} changes nothing: all that it sets ({', '.join(keys)}) is set on the "
+            f"command line ({said}), which goes over it: leave out the ablation or these words"
         )
 
 

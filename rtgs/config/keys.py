@@ -14,6 +14,7 @@ from typing import Any
 
 from rtgs.config.schema import RunConfig
 from rtgs.core.refuse import hints_of, words_of
+from rtgs.methods import find_method
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,20 @@ def _keys_of(settings: Any, prefix: str) -> list[tuple[str, Key]]:
         else:
             found.append((name, Key(name, type(settings), item.name, value)))
     return found
+
+
+def value_of(config: RunConfig, name: str) -> object:
+    """The value at a dotted name.
+
+    Raises:
+        AttributeError: there is no such key.
+    """
+    value: object = config
+    if name.startswith("method.own."):
+        value, name = find_method(config.method.name).own_settings(config.method), name.removeprefix("method.own.")
+    for part in name.split("."):
+        value = getattr(value, part)
+    return value
 
 
 def sentence_of(key: Key) -> str:

@@ -83,7 +83,7 @@ class AblationConfig:
     needs: tuple[str, ...] = ()
     """What a method must have for it (:data:`rtgs.methods.spec.FEATURES`); others are refused. Empty: nothing."""
     idle_with: tuple[str, ...] = ()
-    """Presets in which what it takes away is off already: it is refused with them."""
+    """Presets, and ``key=value``, with which what it takes away is off already: it is refused with them."""
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,7 @@ SHARPEST, KNEE = 0.08, 0.5  # roughness of the first and of the last but one lev
 CONE_SHARE = 0.99  # of D, summed over equal steps of the angle: what is beyond counts as 0 (NVDIFFREC)
 DIFFUSE_SIDE = 16  # of the irradiance map
 _KEPT = threading.local()
+MOST_KEPT = 6 * 64**2  # rows: 3 MB, the finest level of the short presets
 NARROW = 0.9  # cosine of a cone from which on its texels are looked up in a tree
 
 
@@ -187,8 +188,14 @@ def _apply(values: Tensor, level: Filter, *, backward: bool) -> Tensor:
 
 
 def _work(rows: int) -> np.ndarray:
-    """(rows, 32) numbers to work in, kept by each thread: fresh pages would cost more than the filter."""
+    """(rows, 32) numbers to work in. Each thread keeps the small ones: fresh pages would cost more than the filter.
+
+    Large ones go when the filter is done: at side 512 they are 200 MB, and their pages a small part of its time.
+    """
     kept = getattr(_KEPT, "rows", None)
-    if kept is None or len(kept) < rows:
-        kept = _KEPT.rows = np.empty((rows, 32), dtype=np.float32)
-    return kept[:rows]
+    if kept is not None and len(kept) >= rows:
+        return kept[:rows]
+    made = np.empty((rows, 32), dtype=np.float32)
+    if rows <= MOST_KEPT:
+        _KEPT.rows = made
+    return made

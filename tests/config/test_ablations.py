@@ -85,7 +85,9 @@ def test_a_method_refuses_what_takes_nothing_from_it(method: str):
         assert f"ablation={name} takes nothing away from method {method}" in job.problem
 
 
-IDLE = [(name, preset) for name in ABLATIONS for preset in about_ablation(name).get("idle_with", ())]
+IDLE = [
+    (name, preset) for name in ABLATIONS for preset in about_ablation(name).get("idle_with", ()) if "=" not in preset
+]
 
 
 @pytest.mark.parametrize(("ablation", "preset"), IDLE)
@@ -106,6 +108,46 @@ def test_with_a_preset_that_has_it_off_an_ablation_is_refused(ablation: str, pre
         else:
             value = {"no_normal_guide": settings.environment.mono_normal}[ablation]
             assert [value] == [value for _, value in flat_leaves(ablation_file(ablation))]
+
+
+PAPER = ["scene=toycar", "preset=paper"]
+OFF = "method.reflection.propagation.every=0"
+
+
+@pytest.mark.parametrize(("ablation", "method"), [("no_sabotage", "3dgs_dr"), ("rough_grow", "ref_gaussian")])
+def test_with_a_value_that_has_it_off_an_ablation_is_refused(ablation: str, method: str):
+    words = [*PAPER, f"method={method}", f"ablation={ablation}"]
+    compose(words)
+    with pytest.raises(RtgsError) as raised:
+        compose([*words, OFF])
+    said = f"ablation={ablation} takes nothing away from method {method} with {OFF}, where it is off already: leave"
+    assert said in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("ablation", "words"),
+    [
+        ("no_propagation", [OFF]),
+        ("no_propagation", ["method.reflection.propagation.every=500"]),
+        ("no_dssim", ["method.loss.l1=0.7", "method.loss.dssim=0.3"]),
+        ("mcmc", ["method.density={strategy:adaptive}", "method.paper_schedule.densify_until=100"]),
+    ],
+)
+def test_an_ablation_all_of_which_is_set_by_words_is_refused(ablation: str, words: list[str]):
+    """Whatever the values are, the run is the one without it; where words leave one of its keys, it is not."""
+    method = [*PAPER, "method=3dgs_dr"]
+    jobs = compose_jobs([*method, *words, "seed=3", f"ablation=none,{ablation}"], multirun=True)[0]
+    assert (jobs[0].problem, jobs[1].config) == ("", None)
+    assert f"config: ablation={ablation} changes nothing: all that it sets (method." in jobs[1].problem
+    assert f"is set on the command line ({' '.join(words)}), which goes over it" in jobs[1].problem
+    if len(words) > 1:
+        compose([*method, words[0], f"ablation={ablation}"])
+
+
+def test_a_condition_that_names_no_key_is_refused():
+    words = ["scene=toycar", "method=2dgs", "ablation=no_dssim", "ablation.idle_with=['method.los.l1=0']"]
+    with pytest.raises(RtgsError, match=r"ablation=no_dssim names method\.los\.l1, which is no key of method 2dgs"):
+        compose(words)
 
 
 def test_what_is_propagated_is_so_with_the_published_schedule():

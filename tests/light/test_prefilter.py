@@ -1,11 +1,15 @@
 """What rough surfaces see of a cubemap: energy, the published lobes, the kernel against its twin."""
 
+import threading
+
 import numpy as np
 import pytest
 import torch
 
+from rtgs.light import prefilter
 from rtgs.light.faces import texel_directions
 from rtgs.light.prefilter import (
+    MOST_KEPT,
     filter_of,
     filtered,
     filtered_twin,
@@ -101,6 +105,17 @@ def test_filter_bits_do_not_depend_on_the_number_of_threads():
         torch.set_num_threads(threads)
         found.append(filtered(texels, 16, 0.5))
     assert torch.equal(*found)
+
+
+def test_only_the_small_working_memory_is_kept(monkeypatch: pytest.MonkeyPatch):
+    """That of the short presets' levels is one piece for all of them; that of a side of 512 goes when it is done."""
+    monkeypatch.setattr(prefilter, "_KEPT", threading.local())
+    assert np.shares_memory(prefilter._work(6 * 64**2), prefilter._work(6 * 64**2))
+    for side in (512, 16, 32, 64, 128):
+        work = prefilter._work(6 * side**2)
+        assert work.shape == (6 * side**2, 32)
+        assert np.shares_memory(work, prefilter._KEPT.rows) == (side <= 64)
+    assert prefilter._KEPT.rows.nbytes == MOST_KEPT * 32 * 4 < 4e6
 
 
 @pytest.mark.parametrize("roughness", [None, 0.5])

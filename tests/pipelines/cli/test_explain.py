@@ -13,6 +13,7 @@ from rtgs.config.explain import close_keys
 from rtgs.config.keys import config_keys, sentence_of
 from rtgs.config.locate import project_root
 from rtgs.config.provenance import Setting, settings_of
+from rtgs.core.errors import RtgsError
 
 UNDESCRIBED = {
     "AppearanceSettings": "enabled",
@@ -81,6 +82,44 @@ def test_where_a_value_is_that_of_another_key_the_places_of_that_key_are_told():
     rows = explained("method.own.scope_radius", "scene=ref_real/toycar", "method=ref_gs", "preset=paper")
     assert rows["value"] == "2.507"
     assert rows["set in"].startswith("conf/method_on_scene/paper/ref_gs/ref_real/toycar.yaml (before it ")
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (
+            ["schedule.total=${schedule.coarse}", "schedule.coarse=${schedule.total}"],
+            "rtgs explain: schedule.coarse is ${schedule.total} (command line), which leads back to itself: "
+            "schedule.total -> schedule.coarse -> schedule.total; give one of them a value",
+        ),
+        (["schedule.total=${schedule.total}"], "leads back to itself: schedule.total -> schedule.total;"),
+        (
+            ["schedule.total=${schedule.coarse}", "schedule.coarse=${schedule.totl}"],
+            "rtgs explain: schedule.coarse is ${schedule.totl} (command line), but there is no key 'schedule.totl'; "
+            "did you mean schedule.total",
+        ),
+    ],
+)
+def test_keys_that_take_each_others_values_or_those_of_no_key_are_named(words: list[str], expected: str):
+    """Where the run has a value all the same: a word for a whole group may go over those of its keys."""
+    config, _ = compose(["schedule={total: 5, coarse: 1}"])
+    with pytest.raises(RtgsError) as raised:
+        one_key(keys_of(config)["schedule.total"], config, words)
+    assert expected in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("word", "why"),
+    [
+        ("schedule.total=${schedule.total}", "Recursive interpolation detected"),
+        ("schedule.total=${schedule.nothing}", "Interpolation key 'schedule.nothing' not found"),
+    ],
+)
+def test_a_word_that_takes_a_value_that_is_not_there_is_named(word: str, why: str, capsys):
+    assert main(["explain", "schedule.total", word]) == 1
+    key, _, value = word.partition("=")
+    told = f"rtgs: config: {key} on the command line takes {value}: {why}; give a value, or ${{KEY}} of a key that has"
+    assert told in capsys.readouterr().err
 
 
 def test_passwords_are_not_told(monkeypatch, capsys):
