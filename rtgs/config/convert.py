@@ -8,7 +8,6 @@ from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 
-import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -24,7 +23,6 @@ from rtgs.core.errors import RtgsError
 from rtgs.methods import find_method, own_methods
 from rtgs.methods.settings import MethodSettings
 from rtgs.methods.spec import FEATURES
-from rtgs.workflow.fingerprint import flatten
 
 
 def hide_credentials(composed: DictConfig) -> None:
@@ -38,8 +36,8 @@ def to_run_config(composed: DictConfig, choices: Choices) -> tuple[RunConfig, Ch
     """The composed config as dataclasses: interpolations resolved, paths absolute, names derived.
 
     Raises:
-        RtgsError: a mandatory value is missing or an interpolation fails (names the key); the ablation is not for the
-            method, or not for the preset.
+        RtgsError: a mandatory value is missing or an interpolation fails (names the key); the ablation changes nothing
+            of this run.
     """
     hide_credentials(composed)
     try:
@@ -143,11 +141,28 @@ def _refuse_off(config: RunConfig, choices: Choices) -> None:
                 f"config: ablation.idle_with of ablation={choices.ablation} names {key}, which is no key of method "
                 f"{config.method.name}: write KEY=VALUE of a key that `rtgs explain` lists, or a preset"
             ) from error
-        if value == yaml.safe_load(text):
+        if value == OmegaConf.from_dotlist([f"value={text}"])["value"]:
             raise RtgsError(
                 f"{said} {key}={value}, where it is off already: leave the ablation out, or give {key} another value "
                 f"(`rtgs explain {key}` says where it is set)"
             )
+
+
+def _leaves(name: str, content: object) -> list[str]:
+    """The dotted names of the values in a file."""
+    if not isinstance(content, dict):
+        return [name]
+    return [leaf for key, value in content.items() for leaf in _leaves(f"{name}.{key}", value)]
+
+
+def _keys_of_word(word: str) -> list[str]:
+    """The dotted names that a word sets: its own, or those in a group's ``{...}``, which is merged."""
+    name, _, text = word.lstrip("+~").partition("=")
+    if not text.startswith("{"):
+        return [name]
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    return _leaves(name, OverridesParser.create().parse_override(word).value())
 
 
 def _refuse_overridden(choices: Choices) -> None:
@@ -158,12 +173,11 @@ def _refuse_overridden(choices: Choices) -> None:
     file = conf_dir() / "ablation" / f"{choices.ablation}.yaml"
     if choices.ablation in ("", "none") or not file.is_file():
         return
-    words = {word: word.partition("=")[0].lstrip("+~") for word in choices.overrides}
-    content = {group: values for group, values in load_yaml(file).items() if group not in ("ablation", "defaults")}
-    keys = list(flatten(content))
-    over = {word: [key for key in keys if f"{key}.".startswith(f"{name}.")] for word, name in words.items()}
-    if keys and set(keys) == {key for found in over.values() for key in found}:
-        said = " ".join(word for word, found in over.items() if found)
+    words = {key: word for word in choices.overrides for key in _keys_of_word(word)}
+    content = load_yaml(file)
+    keys = [key for group in content if group not in ("ablation", "defaults") for key in _leaves(group, content[group])]
+    if keys and set(keys) <= set(words):
+        said = " ".join(dict.fromkeys(words[key] for key in keys))
         raise RtgsError(
             f"config: ablation={choices.ablation} changes nothing: all that it sets ({', '.join(keys)}) is set on the "
             f"command line ({said}), which goes over it: leave out the ablation or these words"

@@ -182,3 +182,9 @@ def test_each_method_has_its_own_ablations_and_says_whose_they_are(method: str):
 def test_the_papers_glass_is_the_learned_one_and_more():
     learned, paper = (dict(flat_leaves(ablation_file(name))) for name in ("learned_glass", "paper_glass"))
     assert learned.items() <= paper.items()
+
+
+def test_a_group_word_sets_the_keys_in_it_and_no_others(tmp_path):
+    words = ["scene=demo", "method=2dgs", "preset=quick", "ablation=no_densify", "schedule={total: 1500}"]
+    config, _ = compose([*words, f"paths.root={tmp_path}"])
+    assert config.schedule.total == 1500
