@@ -230,7 +230,8 @@ def another_recipe(folder: Path, words: Sequence[str]) -> str:
     from rtgs.config.compose import compose
     from rtgs.core.build import build
     from rtgs.core.errors import RtgsError
-    from rtgs.workflow.fingerprint import flatten, recipe_params
+    from rtgs.core.recipe import flatten
+    from rtgs.workflow.fingerprint import recipe_params
 
     config = compose(list(words))[0]
     kept = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))

@@ -29,6 +29,7 @@ from pipelines.steps import (
 from rtgs.config.convert import judged, pictures_only
 from rtgs.config.schema import Choices, RunConfig
 from rtgs.core.decisions import Decision
+from rtgs.core.recipe import flatten
 from rtgs.methods import find_method
 from rtgs.methods.settings import MethodSettings
 from rtgs.pretrained.keys import ABSENT
@@ -36,7 +37,6 @@ from rtgs.runs.training import StageParams
 from rtgs.train.networks import Named
 from rtgs.train.settings import ScheduleSettings
 from rtgs.workflow import Step, StepKind
-from rtgs.workflow.fingerprint import flatten
 
 KINDS: tuple[StepKind, ...] = (
     sfm.STEP,

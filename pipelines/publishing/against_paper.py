@@ -13,9 +13,9 @@ from rtgs.config.convert import pictures_only
 from rtgs.config.locate import choices_of, conf_dir
 from rtgs.config.schema import RunConfig
 from rtgs.core.documents import load_yaml
+from rtgs.core.recipe import flatten
 from rtgs.methods import find_method
 from rtgs.train.settings import ScheduleSettings
-from rtgs.workflow.fingerprint import flatten
 
 if TYPE_CHECKING:
     from rtgs.methods.settings import MethodSettings

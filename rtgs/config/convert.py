@@ -20,6 +20,7 @@ from rtgs.core.build import build
 from rtgs.core.credentials import ADDRESSES, hide
 from rtgs.core.documents import load_yaml
 from rtgs.core.errors import RtgsError
+from rtgs.core.recipe import flatten
 from rtgs.methods import find_method, own_methods
 from rtgs.methods.settings import MethodSettings
 from rtgs.methods.spec import FEATURES
@@ -148,13 +149,6 @@ def _refuse_off(config: RunConfig, choices: Choices) -> None:
             )
 
 
-def _leaves(name: str, content: object) -> list[str]:
-    """The dotted names of the values in a file."""
-    if not isinstance(content, dict):
-        return [name]
-    return [leaf for key, value in content.items() for leaf in _leaves(f"{name}.{key}", value)]
-
-
 def _keys_of_word(word: str) -> list[str]:
     """The dotted names that a word sets: its own, or those in a group's ``{...}``, which is merged."""
     name, _, text = word.lstrip("+~").partition("=")
@@ -162,7 +156,7 @@ def _keys_of_word(word: str) -> list[str]:
         return [name]
     from hydra.core.override_parser.overrides_parser import OverridesParser
 
-    return _leaves(name, OverridesParser.create().parse_override(word).value())
+    return list(flatten(OverridesParser.create().parse_override(word).value(), name))
 
 
 def _refuse_overridden(choices: Choices) -> None:
@@ -174,8 +168,8 @@ def _refuse_overridden(choices: Choices) -> None:
     if choices.ablation in ("", "none") or not file.is_file():
         return
     words = {key: word for word in choices.overrides for key in _keys_of_word(word)}
-    content = load_yaml(file)
-    keys = [key for group in content if group not in ("ablation", "defaults") for key in _leaves(group, content[group])]
+    content = {group: values for group, values in load_yaml(file).items() if group not in ("ablation", "defaults")}
+    keys = list(flatten(content))
     if keys and set(keys) <= set(words):
         said = " ".join(dict.fromkeys(words[key] for key in keys))
         raise RtgsError(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+from collections.abc import Mapping
 from typing import Any
 
 NOT_IN_RECIPE = {"recipe": False}
@@ -70,3 +71,13 @@ def _plain(value: object, where: str) -> object:
 def _in_recipe(field: dataclasses.Field, value: object) -> bool:
     outside = left_out_at(field)
     return bool(field.metadata.get("recipe", True)) if outside is dataclasses.MISSING else value != outside
+
+
+def flatten(value: object, prefix: str = "") -> dict[str, object]:
+    """Nested parameters as ``{"loss.normal": 0.05, ...}``; lists stay whole."""
+    if isinstance(value, Mapping):
+        flat: dict[str, object] = {}
+        for key, item in value.items():
+            flat |= flatten(item, f"{prefix}.{key}" if prefix else str(key))
+        return flat
+    return {prefix: value}

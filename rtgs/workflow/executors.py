@@ -14,11 +14,11 @@ from typing import Protocol
 from filelock import Timeout
 
 from rtgs.core.credentials import redact
+from rtgs.core.recipe import flatten
 from rtgs.track import NullTracking, RunInfo, Tracking
 from rtgs.track.protocol import STEP_TAG
 from rtgs.workflow.artifacts import Artifacts
 from rtgs.workflow.expectation import Expectation, PlanClock, spoken
-from rtgs.workflow.fingerprint import flatten
 from rtgs.workflow.outcome import StepOutcome, SweepOutcomes, blocked
 from rtgs.workflow.plan import Plan
 from rtgs.workflow.remote import RemoteStore, RemoteStoreError

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
 
 from rtgs.core.recipe import canonical_json
 
@@ -15,16 +14,6 @@ from rtgs.core.recipe import canonical_json
 def fingerprint(value: object) -> str:
     """64 hexadecimal digits: SHA-256 of the canonical JSON of a recipe."""
     return hashlib.sha256(canonical_json(value).encode()).hexdigest()
-
-
-def flatten(value: object, prefix: str = "") -> dict[str, object]:
-    """Nested parameters as ``{"loss.normal": 0.05, ...}``; lists stay whole."""
-    if isinstance(value, Mapping):
-        flat: dict[str, object] = {}
-        for key, item in value.items():
-            flat |= flatten(item, f"{prefix}.{key}" if prefix else str(key))
-        return flat
-    return {prefix: value}
 
 
 def recipe_params(params: object) -> dict[str, object]:

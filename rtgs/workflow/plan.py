@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rtgs.core.errors import RtgsError
-from rtgs.workflow.fingerprint import flatten
+from rtgs.core.recipe import flatten
 from rtgs.workflow.manifest import Manifest
 from rtgs.workflow.remote import RemoteStore
 from rtgs.workflow.step import Step

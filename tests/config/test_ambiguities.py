@@ -10,7 +10,7 @@ import pytest
 
 from rtgs.config import compose
 from rtgs.config.schema import RunConfig
-from rtgs.workflow.fingerprint import flatten
+from rtgs.core.recipe import flatten
 from tests.docs.register import DEFAULT, LABELS, REGISTER, entries, overrides_of, setting_of, value_of
 
 OPEN_QUESTIONS = 28  # of the paper; what follows them are rtgs's own differences

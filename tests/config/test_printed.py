@@ -12,10 +12,10 @@ import yaml
 from rtgs.config import compose
 from rtgs.config.locate import choices_of, conf_dir
 from rtgs.config.schema import RunConfig
+from rtgs.core.recipe import flatten
 from rtgs.methods import find_method
 from rtgs.methods.spec import BEYOND_PAPER, PROPAGATION, SABOTAGE
 from rtgs.optics.microfacet import specular_weights
-from rtgs.workflow.fingerprint import flatten
 
 NUMBERS = {  # printed in the paper, with preset=paper
     "schedule.total": 60_000,

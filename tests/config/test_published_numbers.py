@@ -7,7 +7,7 @@ from dataclasses import asdict
 import pytest
 
 from rtgs.config import compose
-from rtgs.workflow.fingerprint import flatten
+from rtgs.core.recipe import flatten
 
 RATES = {
     "means_initial": 1.6e-4,

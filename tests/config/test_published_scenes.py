@@ -19,10 +19,10 @@ from rtgs.config import RunConfig, compose
 from rtgs.config.locate import choices_of, conf_dir
 from rtgs.config.provenance import settings_of
 from rtgs.core.errors import RtgsError
+from rtgs.core.recipe import flatten
 from rtgs.methods import find_method
 from rtgs.methods.plans import reflection_plan
 from rtgs.train.schedule import loss_start
-from rtgs.workflow.fingerprint import flatten
 
 ENVGS = {  # steps, and what is not one
     "sedan": {"total": 60_000, "sh_from": 0, "window": 30_000, "propagation": 24_000, "k_s": 1e-3, "perceptual": 0.01},

@@ -17,9 +17,9 @@ from recipes import TRAINED, fitting
 from rtgs.config import compose
 from rtgs.config.locate import choices_of, conf_dir
 from rtgs.config.schema import RunConfig
+from rtgs.core.recipe import flatten
 from rtgs.methods.settings import TransmittanceSettings
 from rtgs.optics.settings import WallSettings
-from rtgs.workflow.fingerprint import flatten
 
 GROUPS = ("scene", "sfm", "masks", "normals", "method", "judge", "tracking")  # below: the schema
 SCHEMA = flatten(asdict(RunConfig()))

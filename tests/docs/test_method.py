@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from rtgs.config.schema import RunConfig
+from rtgs.core.recipe import flatten
 from rtgs.evaluate.tables import PAPER_SCORES, PaperScore
 from rtgs.optics.microfacet import ggx_distribution, remap_roughness
-from rtgs.workflow.fingerprint import flatten
 from tests.docs.register import REGISTER, ROOT
 
 PAGE = (ROOT / "docs/method.md").read_text(encoding="utf-8")

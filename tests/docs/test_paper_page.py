@@ -6,7 +6,7 @@ from dataclasses import asdict
 
 from pipelines.publishing.against_paper import keys_of
 from rtgs.config import compose
-from rtgs.workflow.fingerprint import flatten
+from rtgs.core.recipe import flatten
 from tests.docs.register import ROOT, value_of
 
 PAGE = ROOT / "docs/paper.md"

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from rtgs.core.build import build
-from rtgs.core.recipe import NOT_IN_RECIPE, UNLESS_DEFAULT, canonical_json
+from rtgs.core.recipe import NOT_IN_RECIPE, UNLESS_DEFAULT, canonical_json, flatten
 from rtgs.optics.settings import OpticsSettings
-from rtgs.workflow.fingerprint import fingerprint, flatten, recipe_params
+from rtgs.workflow.fingerprint import fingerprint, recipe_params
 
 
 @dataclass(frozen=True)
