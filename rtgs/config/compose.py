@@ -10,6 +10,7 @@ from omegaconf import DictConfig
 from rtgs.config.convert import to_run_config, with_own
 from rtgs.config.opened import opened_configs
 from rtgs.config.schema import Choices, RunConfig, register_schema
+from rtgs.config.words import unresolved
 from rtgs.core.build import build
 from rtgs.core.credentials import redact
 from rtgs.core.errors import RtgsError
@@ -105,9 +106,11 @@ def _resolved(overrides: Sequence[str]) -> list[str]:
         except OmegaConfBaseException as error:
             word = str(overrides._get_node(index)) if isinstance(overrides, ListConfig) else ""
             taken = " and ".join(re.findall(r"\$\{[\w.]+\}", word))  # not all of the value: it may hold a password
+            if not taken:
+                raise RtgsError(f"config: {unresolved(error, _key(word))}") from error
             raise RtgsError(
-                f"config: {_key(word)} on the command line takes {taken or 'what is not there'}: "
-                f"{str(error).splitlines()[0]}; give a value, or ${{KEY}} of a key that has a value of its own"
+                f"config: {_key(word)} on the command line takes {taken}: {str(error).splitlines()[0]}; give a value, "
+                "or ${KEY} of a key that has a value of its own"
             ) from error
     return found
 

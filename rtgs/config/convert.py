@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -15,7 +14,7 @@ from rtgs.config.keys import value_of
 from rtgs.config.locate import choices_of, conf_dir
 from rtgs.config.names import derive_name, run_name
 from rtgs.config.schema import Choices, RunConfig
-from rtgs.config.words import FOLDER_CHOICE, quoted
+from rtgs.config.words import FOLDER_CHOICE, quoted, unresolved
 from rtgs.core.build import build
 from rtgs.core.credentials import ADDRESSES, hide
 from rtgs.core.documents import load_yaml
@@ -44,7 +43,7 @@ def to_run_config(composed: DictConfig, choices: Choices) -> tuple[RunConfig, Ch
     try:
         values = OmegaConf.to_container(composed, resolve=True, throw_on_missing=True)
     except OmegaConfBaseException as error:
-        raise RtgsError(f"config: {_in_words(error)}") from error
+        raise RtgsError(f"config: {unresolved(error, error.full_key or 'a value')}") from error
     assert isinstance(values, dict)
     config = build(RunConfig, {str(key): value for key, value in values.items()})
     _refuse_idle_ablation(config, choices)
@@ -74,14 +73,6 @@ def to_run_config(composed: DictConfig, choices: Choices) -> tuple[RunConfig, Ch
     if name != Path(name).name or name == "..":
         raise RtgsError(f"config: name={name!r} is to be one folder in runs/: give a name without / that is not ..")
     return replace(config, name=name), choices
-
-
-def _in_words(error: OmegaConfBaseException) -> str:
-    """What is wrong with a value that does not resolve, and what to do."""
-    if variable := re.search(r"Environment variable '(\w+)' not found", str(error)):
-        name, key = variable[1], error.full_key
-        return f"{key} is taken from the environment variable {name}, which is not set: set it, or give {key}=VALUE"
-    return f"{error}; set it on the command line or in its YAML file"
 
 
 def own_name(config: RunConfig, choices: Choices) -> str:

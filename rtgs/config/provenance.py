@@ -49,8 +49,9 @@ def settings_of(key: str, words: Sequence[str]) -> list[Setting]:
             if value is not _ABSENT:
                 found.append(Setting(f"{_folder(loaded.path)}/{default.config_path}.yaml", str(value)))
         for override in overrides:
-            if override.key_or_group == key:
-                found.append(Setting("command line", str(override.value())))
+            value = _at(_nested(override.key_or_group, override.value()), key)
+            if value is not _ABSENT:
+                found.append(Setting("command line", str(value)))
     return found
 
 
@@ -58,6 +59,13 @@ def _folder(searched: str) -> str:
     """The folder of configs, as people name it; ``searched`` is Hydra's address of it."""
     folder = searched.removeprefix("file://")
     return "conf" if Path(folder) == conf_dir() else folder
+
+
+def _nested(key: str, value: Any) -> Any:
+    """A word's value as the tree that is merged: it may be of a whole group."""
+    for part in reversed(key.split(".")):
+        value = {part: value}
+    return value
 
 
 def _at(tree: Any, key: str) -> Any:

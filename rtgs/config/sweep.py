@@ -60,7 +60,8 @@ def compose_jobs(words: Sequence[str], multirun: bool) -> tuple[tuple[ComposedJo
             master = state.hydra.compose_config(
                 "config", words, run_mode=RunMode.RUN, with_log_configuration=False, from_shell=True
             )
-            return (_job(without_hydra(master), master.hydra.runtime.choices, master.hydra.overrides.task),), False
+            hydra = master.hydra
+            return (_job(without_hydra(master), hydra.runtime.choices, hydra.overrides.task, _words(master)),), False
         loader: Any = state.config_loader()
         composer = _Composer(loader, master)
         return tuple(composer.job(combination) for combination in _combinations(loader, master)), True
@@ -113,7 +114,7 @@ class _Composer:
             own = copy.deepcopy(own)
         for override in self._parser.parse_overrides(plain):
             _set(own, override.key_or_group, override.value(), override.input_line or "")
-        return _job(own, groups, words)
+        return _job(own, groups, words, words)
 
     def _sets_a_value(self, word: str) -> bool:
         """``key=value`` of a key of ours; what chooses, adds or removes goes through Hydra."""
@@ -134,8 +135,9 @@ def _set(config: DictConfig, key: str, value: object, word: str) -> None:
         raise ConfigCompositionException(f"Error merging override {word}") from error
 
 
-def _job(composed: DictConfig, groups: Any, words: Sequence[str]) -> ComposedJob:
+def _job(composed: DictConfig, groups: Any, overrides: Sequence[str], words: Sequence[str]) -> ComposedJob:
+    """The job of ``overrides``; ``words`` are the same as they were given, which can always be read."""
     try:
-        return ComposedJob(tuple(words), *to_run_config(composed, choices_from(groups, words)))
+        return ComposedJob(tuple(words), *to_run_config(composed, choices_from(groups, overrides)))
     except (RtgsError, ValueError) as error:  # ValueError: a setting out of its range
         return ComposedJob(tuple(words), None, None, str(error))

@@ -88,3 +88,12 @@ def quoted(text: str) -> str:
     """A value in quotes, as Hydra takes it whatever is in it."""
     escaped = text.replace("\\", "\\\\").replace("'", "\\'") if "'" in text else text
     return f"'{escaped}'"
+
+
+def unresolved(error: BaseException, key: str) -> str:
+    """What is wrong with the value of ``key``, whose ``${...}`` stands for nothing, and what to do."""
+    first = (str(error).splitlines() or [""])[0]
+    if variable := re.search(r"Environment variable '(\w+)' not found", first):
+        name = variable[1]
+        return f"{key} is taken from the environment variable {name}, which is not set: set it, or give {key}=VALUE"
+    return f"{key}: {first}; set it on the command line or in its YAML file"

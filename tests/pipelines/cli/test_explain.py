@@ -120,6 +120,16 @@ def test_a_word_that_takes_a_value_that_is_not_there_is_named(word: str, why: st
     key, _, value = word.partition("=")
     told = f"rtgs: config: {key} on the command line takes {value}: {why}; give a value, or ${{KEY}} of a key that has"
     assert told in capsys.readouterr().err
+    assert main(["plan", word]) == 1
+    assert told in capsys.readouterr().err
+
+
+def test_a_variable_that_is_not_set_is_named_with_the_key_that_takes_it(monkeypatch, capsys):
+    monkeypatch.delenv("RTGS_NOT_SET", raising=False)
+    told = "config: schedule.total is taken from the environment variable RTGS_NOT_SET, which is not set"
+    for command in (["plan"], ["explain", "schedule.total"]):
+        assert main([*command, "schedule.total=${oc.env:RTGS_NOT_SET}"]) == 1
+        assert told in capsys.readouterr().err
 
 
 def test_passwords_are_not_told(monkeypatch, capsys):
@@ -130,6 +140,11 @@ def test_passwords_are_not_told(monkeypatch, capsys):
     said = capsys.readouterr().out
     assert said.count("http://***@127.0.0.1:9/long") == 3
     assert "secret" not in said
+
+
+def test_a_word_for_a_group_counts_as_a_place_of_the_keys_in_it():
+    words = ["schedule={total: 5}", "schedule.total=6", "schedule={coarse: 2}"]
+    assert [each.text for each in settings_of("schedule.total", words) if each.place == "command line"] == ["5", "6"]
 
 
 def test_places_come_in_the_order_in_which_they_count():
