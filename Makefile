@@ -90,7 +90,11 @@ reproduce-fig-split-sum: setup ## microfacet weight against split-sum shading
 	$(call of_data,ref_real)$(CHECK_DATA)
 	$(TABLE) experiment=fig_split_sum $(RUN)
 
-reproduce-figures: reproduce-table1 reproduce-table2 reproduce-table3 reproduce-fig-split-sum ## panels of pictures, PNG and PDF, from the runs of all tables (PRESET=)
+.PHONY: figures-data
+figures-data: # before anything is trained
+	$(if $(filter stand_in,$(DATA)),,$(error DATA=$(DATA): conf/figure is of the shipped stand-ins; make the table with DATA, and draw it by a figure file of its scenes and views: rtgs figures FILE preset=$(PRESET)))
+
+reproduce-figures: figures-data reproduce-table1 reproduce-table2 reproduce-table3 reproduce-fig-split-sum ## panels of pictures, PNG and PDF, from the runs of all tables (PRESET=)
 	$(BIN)/rtgs figures preset=$(PRESET)
 
 reproduce-time-quality: PRESET := $(PRESETS)

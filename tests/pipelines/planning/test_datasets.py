@@ -123,6 +123,14 @@ def test_a_table_on_the_data_of_another_is_refused(table, data, fits):
     assert f"DATA={data}: this table is of stand_in or {fits}" in done.stderr
 
 
+def test_panels_of_the_papers_data_are_refused_before_any_table_is_made():
+    words = ["make", "-n", "reproduce-figures", "DATA=ref_real"]
+    done = subprocess.run(words, cwd=project_root(), capture_output=True, text=True)
+    assert done.returncode == 2
+    assert "rtgs figures FILE" in done.stderr
+    assert "rtgs run" not in done.stdout
+
+
 def test_the_papers_figures_are_not_for_stand_ins():
     with pytest.raises(RtgsError, match=r"scene sedan is a path-traced stand-in.*ref_real"):
         compose(["experiment=table1", "scene=sedan", "table.data=paper"])
