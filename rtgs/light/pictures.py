@@ -20,6 +20,7 @@ from rtgs.light.cubemap import DirectionalLight
 from rtgs.optics.light import decoded
 
 PANORAMA, RADIANCE, CUBE = "environment.png", "environment.exr", "environment_cube.npy"
+FACES = ("px", "nx", "py", "ny", "pz", "nz")  # their files: what other programs call +x, -x and so on
 
 # Faces of OpenGL (its specification, table of cube map faces): middle, and where columns and rows grow to.
 _GL_FACES = (
@@ -93,7 +94,8 @@ def save_environment(folder: Path, light: DirectionalLight, frame: np.ndarray, s
 
     Files, each as a whole or not at all: ``environment.png`` (panorama, 2 side high), ``environment.exr`` (the same,
     linear, :func:`save_radiance`) and ``environment_cube.npy`` (6, side, side, 3) float32, encoded, the faces of
-    :func:`face_directions`.
+    :func:`face_directions`. Then each of them as ``px.png`` and, linear, ``px.exr``, and so on (:data:`FACES`). Returns
+    the first three.
 
     Raises:
         RtgsError: the light is not finite.
@@ -103,20 +105,30 @@ def save_environment(folder: Path, light: DirectionalLight, frame: np.ndarray, s
     panorama = light_picture(light, panorama_directions(2 * side, frame))
     paths = tuple(folder / name for name in (PANORAMA, RADIANCE, CUBE))
     save_radiance(paths[1], decoded(torch.from_numpy(panorama), "linear").numpy())
-    bytes_ = np.round(255 * panorama.clip(0, 1)).astype(np.uint8)
-    _, packed = cv2.imencode(".png", np.ascontiguousarray(bytes_[..., ::-1]))
-    with whole_file(paths[0]) as partial:
-        partial.write_bytes(packed.tobytes())
+    _save_png(paths[0], panorama)
+    faces = light_picture(light, face_directions(side, frame))
     with whole_file(paths[2]) as partial, partial.open("wb") as stream:
-        np.save(stream, light_picture(light, face_directions(side, frame)))
+        np.save(stream, faces)
+    for name, face in zip(FACES, faces, strict=True):
+        _save_png(folder / f"{name}.png", face)
+        save_radiance(folder / f"{name}.exr", decoded(torch.from_numpy(face), "linear").numpy(), panorama=False)
     return paths
 
 
-def save_radiance(path: Path, linear: np.ndarray) -> None:
-    """Write a panorama (H, 2 H, 3) float32 of linear light, red, green, blue, as :func:`panorama_directions` has them.
+def _save_png(path: Path, encoded: np.ndarray) -> None:
+    """Write (H, W, 3) colours from 0 to 1 with 8 bit."""
+    bytes_ = np.round(255 * encoded.clip(0, 1)).astype(np.uint8)
+    _, packed = cv2.imencode(".png", np.ascontiguousarray(bytes_[..., ::-1]))
+    with whole_file(path) as partial:
+        partial.write_bytes(packed.tobytes())
+
+
+def save_radiance(path: Path, linear: np.ndarray, *, panorama: bool = True) -> None:
+    """Write (H, W, 3) float32 of linear light, red, green, blue: a panorama as :func:`panorama_directions` has it.
 
     OpenEXR, 32 bit, without loss, Rec. 709 primaries (what a file means that names none), marked as a map of longitude
-    and latitude. Seen from inside, as in OpenEXR's own layout, so renderers take it as it is.
+    and latitude (not where it is no ``panorama``, but a face). Seen from inside, as in OpenEXR's own layout, so
+    renderers take it as it is.
 
     Raises:
         RtgsError: a value is NaN or infinite, or the file cannot be written.
@@ -126,11 +138,9 @@ def save_radiance(path: Path, linear: np.ndarray) -> None:
     if not np.isfinite(linear).all():
         count = np.count_nonzero(~np.isfinite(linear).all(-1))
         raise RtgsError(f"{path}: {count} pixels of the environment are NaN or infinite; nothing is written")
-    header = {
-        "type": OpenEXR.scanlineimage,
-        "compression": OpenEXR.ZIP_COMPRESSION,
-        "envmap": OpenEXR.ENVMAP_LATLONG,
-    }
+    header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
+    if panorama:
+        header["envmap"] = OpenEXR.ENVMAP_LATLONG
     with whole_file(path) as partial:
         try:
             with OpenEXR.File(header, {"RGB": np.ascontiguousarray(linear, dtype=np.float32)}) as file:

@@ -22,6 +22,7 @@ from rtgs.workflow.plan import topological
 
 GOLDEN = Path(__file__).with_name("golden_recipes.json")
 TRAINED = tuple(name for name in choices_of("method") if not find_method(name).elsewhere)
+PUBLISHED_ELSEWHERE = {"3dgs_dr", "gaussian_shader", "ref_gaussian", "ref_gs", "envgs"}  # with code of their authors
 SCENES = ("ball_statue", "toycar", "matte_room")
 STAND_INS = {"ref_real/sedan": "sedan", "ref_real/gardenspheres": "spheres", "ref_real/toycar": "toycar"}
 SHIPPED = [f"scene.{key}" for key in ("format=auto", "images_dir=null", "model_dir=null", "resize_ratio=null")]

@@ -2,7 +2,7 @@
 as published; other presets and other scenes have nothing of it.
 
 Read in zju3dv/EnvGS 4dce5a4 (configs/exps/envgs/ref_real and configs/datasets/ref_real), and in train.sh of
-gapszju/3DGS-DR 857c95e, YoujiaZhang/Ref-GS bf843b7 and fudan-zvg/ref-gaussian af7691a.
+gapszju/3DGS-DR e285f6b, YoujiaZhang/Ref-GS bf843b7 and fudan-zvg/ref-gaussian af7691a.
 """
 
 from __future__ import annotations

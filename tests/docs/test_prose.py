@@ -21,6 +21,7 @@ LIMITS = {
     "docs/transmittance.md": 750,
 }
 REFERENCES = {"docs/method.md", "docs/decisions.md", "docs/api.md"}  # looked up by number, not read through
+METHOD_LINES = 60  # of the page of a method
 LAST_LINE = 90  # of README: one screen of substance
 TARGET = re.compile(r"\]\([^()\s]+\)")
 LINK = re.compile(r"\]\(([^()\s#]+\.md)(?:#[\w-]+)?\)")
@@ -64,6 +65,12 @@ def test_lines_fit(path: Path) -> None:
 @pytest.mark.parametrize("path", user_pages(), ids=name)
 def test_a_user_page_is_a_page_or_two(path: Path) -> None:
     assert words(path.read_text(encoding="utf-8")) <= LIMITS.get(name(path), MOST_WORDS)
+
+
+@pytest.mark.parametrize("method", ["3dgs_dr", "gaussian_shader", "ref_gaussian", "ref_gs", "external"])
+def test_the_page_of_a_method_has_sixty_lines_at_most(method: str) -> None:
+    """Those of 2dgs, 3dgs, envgs and rtgs are parts of other pages."""
+    assert len((DOCS / f"{method}.md").read_text(encoding="utf-8").splitlines()) <= METHOD_LINES
 
 
 def test_readme_is_one_screen_of_substance() -> None:

@@ -14,6 +14,7 @@ from rtgs.light.cubemap import CubemapLight
 from rtgs.light.faces import texel_directions
 from rtgs.light.pictures import (
     CUBE,
+    FACES,
     PANORAMA,
     RADIANCE,
     face_directions,
@@ -82,7 +83,25 @@ def test_files_hold_the_light_encoded_and_linear(tmp_path):
     )
     np.testing.assert_array_equal(linear, decoded(torch.from_numpy(expected), "linear").numpy())
     np.testing.assert_allclose(np.load(cube), light_picture(coloured(), face_directions(16, frame)))
-    assert {path.name for path in (tmp_path / "environment").iterdir()} == {PANORAMA, RADIANCE, CUBE}
+    faces = {f"{name}.{kind}" for name in FACES for kind in ("png", "exr")}
+    assert {path.name for path in (tmp_path / "environment").iterdir()} == {PANORAMA, RADIANCE, CUBE} | faces
+
+
+def test_each_face_has_the_file_that_is_named_after_its_middle(tmp_path):
+    """``px`` is right, ``py`` up, ``nz`` ahead; rows and columns are those of the faces that are tested above."""
+    frame = upright(UP, AHEAD)
+    save_environment(tmp_path, coloured(), frame, 16)
+    faces = light_picture(coloured(), face_directions(16, frame))
+    brightest = {"py": 0, "px": 1, "nz": 2}  # channel that is 1 in the middle
+    for name, face in zip(("px", "nx", "py", "ny", "pz", "nz"), faces, strict=True):
+        seen = cv2.imread(str(tmp_path / f"{name}.png"))[..., ::-1] / 255
+        np.testing.assert_allclose(seen, face, atol=0.51 / 255)
+        if name in brightest:
+            assert seen[7:9, 7:9, brightest[name]].mean() > 0.95
+        with OpenEXR.File(str(tmp_path / f"{name}.exr")) as file:
+            assert "envmap" not in file.header()
+        linear = decoded(torch.from_numpy(face), "linear").numpy()
+        np.testing.assert_array_equal(written(tmp_path / f"{name}.exr"), linear)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import torch
 from pipelines.steps import render, report
 from rtgs.core.cameras import Camera
 from rtgs.light.cubemap import CubemapLight
-from rtgs.light.pictures import CUBE, PANORAMA, RADIANCE
+from rtgs.light.pictures import CUBE, FACES, PANORAMA, RADIANCE
 from rtgs.light.settings import CubemapSettings
 from rtgs.methods import Mode, RenderedView, RenderOptions
 from rtgs.methods.parts.part import Frame, Raster
@@ -197,7 +197,8 @@ def test_a_far_light_is_written_the_right_way_up_and_other_methods_write_none(co
     again.out.mkdir()
     light = CubemapLight(texels, CubemapSettings(side=4, activation="identity"))
     run(again, CountingMethod(glass=False, light=light), monkeypatch, maps=False)
-    assert {path.name for path in (again.out / render.ENVIRONMENT).iterdir()} == {PANORAMA, RADIANCE, CUBE}
+    faces = {f"{name}.{kind}" for name in FACES for kind in ("png", "exr")}
+    assert {path.name for path in (again.out / render.ENVIRONMENT).iterdir()} == {PANORAMA, RADIANCE, CUBE} | faces
     panorama = report._environment(again.out / render.ENVIRONMENT)
     assert panorama is not None
     assert panorama.shape == (256, 512, 3)
