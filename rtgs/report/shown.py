@@ -63,7 +63,8 @@ def shown_layer(name: str, maps: Mapping[str, Tensor], camera: Camera, depths: D
 
     ``final`` is the image; ``diffuse`` what the base set adds to it, (1 - k_s) C_d; ``reflection`` k_s w_r C_r and
     ``transmission`` k_s w_t C_t, what the rays add; ``normal`` in the camera's frame; ``depth`` over disparity, near
-    warm; ``weights`` red k_s w_r, green 1 - k_s, blue k_s w_t (method.md 3.3).
+    warm; ``weights`` red k_s w_r, green 1 - k_s, blue k_s w_t (method.md 3.3). Other methods have a weight of their own
+    in the place of k_s w_r, and in that of k_s what their spec says of the layer ``specular``.
 
     Args:
         maps: ``image`` (3, H, W), ``depth`` and ``alpha`` (H, W), ``normal`` (3, H, W) world, and the layers by name.
