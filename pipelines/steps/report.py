@@ -156,8 +156,13 @@ def _layers(maps: dict[str, Tensor]) -> dict[str, Tensor]:
 def _symbols(inputs: Mapping[str, Path]) -> Mapping[str, str]:
     """What the layers are in the symbols of the method; of another program's nothing is known."""
     from rtgs.methods import find_method
+    from rtgs.methods.spec import MIRROR
 
-    return find_method(stage_params(last_training(inputs)).method.name).layers if has_training(inputs) else {}
+    if not has_training(inputs):
+        return {}
+    method = stage_params(last_training(inputs)).method
+    spec = find_method(method.name)
+    return {**spec.layers, "diffuse": "C_d"} if method.optics.additive and MIRROR in spec.has else spec.layers
 
 
 def _boundary(training: Path) -> list[Decision]:
