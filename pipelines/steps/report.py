@@ -18,7 +18,7 @@ from rtgs.core.decisions import Decision
 from rtgs.core.records import damaged
 from rtgs.evaluate.judgement import JudgeRecord
 from rtgs.mesh.record import RECORD_FILE, MeshRecord
-from rtgs.runs.training import has_training, last_training, read_history
+from rtgs.runs.training import has_training, last_training, read_history, stage_params
 from rtgs.runs.views import read_coverage, read_render
 from rtgs.workflow import StepContext, StepKind
 from rtgs.workflow.manifest import Manifest
@@ -127,6 +127,7 @@ def _views(table: EvaluationTable, context: StepContext, count: int) -> tuple[Re
     from rtgs.scenes.canonical import read_scene
 
     photos = {view.name: view for view in context.read("import_scene", read_scene).test}
+    symbols = _symbols(context.inputs)
     views = []
     for row, role in pick_views(table, count):
         name = table.rows[row].view
@@ -135,7 +136,9 @@ def _views(table: EvaluationTable, context: StepContext, count: int) -> tuple[Re
         shown = {key: maps.get(key) for key in ("depth", "normal", "alpha")}
         shown["framed"] = read_coverage(context.inputs["render"], name)
         seen = (name, photo.camera, photo.image, maps["image"], role)
-        views.append(ReportView(*seen, layers=_layers(maps), mask=photo.mask, truth=photo.truth, **shown))
+        views.append(
+            ReportView(*seen, layers=_layers(maps), symbols=symbols, mask=photo.mask, truth=photo.truth, **shown)
+        )
     return tuple(views)
 
 
@@ -148,6 +151,18 @@ def _layers(maps: dict[str, Tensor]) -> dict[str, Tensor]:
     names = (*LAYERS, "normal", "specular", "roughness", "f0")
     whole = {"diffuse": added_by_base(maps)} if {"specular", "diffuse"} <= maps.keys() else {}
     return whole | {name: maps[name] for name in names if name in maps}
+
+
+def _symbols(inputs: Mapping[str, Path]) -> Mapping[str, str]:
+    """What the layers are in the symbols of the method; of another program's nothing is known."""
+    from rtgs.methods import find_method
+    from rtgs.methods.spec import MIRROR
+
+    if not has_training(inputs):
+        return {}
+    method = stage_params(last_training(inputs)).method
+    spec = find_method(method.name)
+    return {**spec.layers, "diffuse": "C_d"} if method.optics.additive and MIRROR in spec.has else spec.layers
 
 
 def _boundary(training: Path) -> list[Decision]:
@@ -229,4 +244,4 @@ def _steps(context: StepContext) -> tuple[StepLine, ...]:
     return tuple(lines)
 
 
-STEP = StepKind("report", 9, report)
+STEP = StepKind("report", 10, report)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rtgs.methods.family import DIFFUSE, REFLECTION
+from rtgs.methods.family import DIFFUSE, REFLECTION, TRACED_LAYERS
 from rtgs.methods.spec import HARMONICS, MIRROR, PROPAGATION, SABOTAGE, SURFACE, MethodSpec
 
 if TYPE_CHECKING:
@@ -30,4 +30,4 @@ def build(setup: Setup) -> Model:
 
 
 _HAS = frozenset({HARMONICS, SURFACE, MIRROR, PROPAGATION, SABOTAGE})
-SPEC = MethodSpec("envgs", (DIFFUSE, REFLECTION), build, _HAS)
+SPEC = MethodSpec("envgs", (DIFFUSE, REFLECTION), build, _HAS, layers=TRACED_LAYERS)

@@ -27,6 +27,14 @@ def _transmittance_on(settings: MethodSettings) -> bool:
     return settings.transmittance.enabled
 
 
+TRACED_LAYERS = {
+    "diffuse": "(1 − k_s) C_d",
+    "reflection": "k_s w_r C_r",
+    "transmission": "k_s w_t C_t",
+    "specular": "k_s",
+}
+"""Of methods that trace: :attr:`rtgs.methods.spec.MethodSpec.layers`."""
+
 DIFFUSE = StageSpec("diffuse", reads=diffuse_alone, version=6)
 """One base set, rasterised: the whole of 2DGS and 3DGS, the beginning of the others."""
 

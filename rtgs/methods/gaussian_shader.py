@@ -124,4 +124,16 @@ def _shaded(settings: MethodSettings) -> MethodSettings:
 
 
 _HAS = frozenset({FAR_LIGHT, FORWARD})
-SPEC = MethodSpec("gaussian_shader", (StageSpec(STAGE, reads=_shaded, version=2),), build, _HAS, own=ShaderSettings)
+_LAYERS = {
+    "diffuse": "colour, residual and (1 − tint) × irradiance",
+    "reflection": "(tint a + b) × light of the mirror direction",
+    "specular": "tint, mean of its colours",
+}
+SPEC = MethodSpec(
+    "gaussian_shader",
+    (StageSpec(STAGE, reads=_shaded, version=2),),
+    build,
+    _HAS,
+    own=ShaderSettings,
+    layers=_LAYERS,
+)

@@ -102,4 +102,5 @@ SPEC = MethodSpec(
     build,
     frozenset({HARMONICS, FAR_LIGHT, PROPAGATION, SABOTAGE}),
     own=DeferredSettings,
+    layers={"diffuse": "(1 − m) C_d", "reflection": "m C_r", "specular": "m"},
 )

@@ -119,4 +119,10 @@ SPEC = MethodSpec(
     build,
     has=frozenset({HARMONICS, SURFACE, FAR_LIGHT, METAL, PROPAGATION}),
     own=RefGaussianSettings,
+    layers={
+        "diffuse": "(1 − M) C_d",
+        "reflection": "A (F_0 a + b) L",
+        "specular": "metalness M; dielectrics reflect too",
+        "f0": "F_0 = 0.04 (1 − M) + ρ M",
+    },
 )

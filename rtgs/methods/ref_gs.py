@@ -106,4 +106,10 @@ def feature_terms(base: BaseSet, own: FeatureSettings, setup: Setup) -> Sequence
 
 
 _HAS = frozenset({HARMONICS, SURFACE, FAR_LIGHT, FEATURE_LIGHT})
-SPEC = MethodSpec("ref_gs", cubemap_stages(), build, _HAS, own=FeatureSettings)
+_LAYERS = {
+    "diffuse": "albedo inside of the scope, colours outside",
+    "reflection": "light of the feature map inside of the scope; as linear light the two add up",
+    "specular": "how much of a pixel is inside of the scope, not how much it reflects",
+    "roughness": "which level of the feature map is looked up",
+}
+SPEC = MethodSpec("ref_gs", cubemap_stages(), build, _HAS, own=FeatureSettings, layers=_LAYERS)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rtgs.methods.family import DIFFUSE, REFLECTION, TRANSMITTANCE
+from rtgs.methods.family import DIFFUSE, REFLECTION, TRACED_LAYERS, TRANSMITTANCE
 from rtgs.methods.spec import (
     BEYOND_PAPER,
     GLASS,
@@ -50,4 +50,4 @@ def build(setup: Setup) -> Model:
 
 
 _HAS = frozenset({HARMONICS, SURFACE, MIRROR, MICROFACET, GLASS, BEYOND_PAPER, PROPAGATION, SABOTAGE})
-SPEC = MethodSpec("rtgs", (DIFFUSE, REFLECTION, TRANSMITTANCE), build, _HAS)
+SPEC = MethodSpec("rtgs", (DIFFUSE, REFLECTION, TRANSMITTANCE), build, _HAS, layers=TRACED_LAYERS)

@@ -381,7 +381,18 @@ class MethodSettings:
         return ""
 
     def in_scene(self, *, glass: bool) -> MethodSettings:
-        """As they are in a scene in which the stage for transparent objects runs (``glass``), or does not."""
+        """As they are in a scene in which the stage for transparent objects runs (``glass``), or does not.
+
+        Raises
+        ------
+        RtgsError
+            There light that passes through an object would be added to the object's own colour.
+        """
+        if glass and self.optics.additive:
+            raise RtgsError(
+                "method.optics.weight=additive takes nothing from a surface's own colour, so the light behind a "
+                "transparent object would be added to it: choose another weight, or method.transmittance.enabled=false"
+            )
         start, latest = self.reflection.start, self.reflection.start_before_glass
         start = start if latest is None or not glass else min(start, latest)
         return replace(self, reflection=replace(self.reflection, start=start, start_before_glass=None))

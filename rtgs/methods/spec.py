@@ -6,8 +6,8 @@ file in ``conf/method`` (docs/new_method.md shows one from the first line to the
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from rtgs.core.build import build_checked
@@ -123,6 +123,7 @@ class MethodSpec:
         own: a frozen dataclass of plain values, the settings that only this method has: keys ``method.own.<field>``.
             None: there are none.
         elsewhere: its pictures are another program's: it has no stages, and nothing is trained.
+        layers: what layers of its pictures are in its own symbols, by name, for captions of reports.
     """
 
     name: str
@@ -131,6 +132,7 @@ class MethodSpec:
     has: frozenset[str] = frozenset()
     own: type | None = None
     elsewhere: bool = False
+    layers: Mapping[str, str] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
         if self.elsewhere:

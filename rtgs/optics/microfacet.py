@@ -102,13 +102,14 @@ def specular_weights(cosine: Tensor, roughness: Tensor, f0: Tensor, settings: Op
 
     Returns:
         Weights of the shape of ``f0``. Finite, with bounded gradients, for every input in range. ``split_sum`` and
-        ``microfacet`` with ``max_gain`` 1 conserve energy: reflection + transmission <= 1.
+        ``microfacet`` with ``max_gain`` 1 conserve energy: reflection + transmission <= 1. ``blend`` and ``additive``
+        are 1 and 0.
     """
     if settings.detach_cosine:
         cosine = cosine.detach()
     if f0.ndim == cosine.ndim + 1:
         cosine, roughness = cosine[..., None], roughness[..., None]
-    if settings.weight == "envgs":
+    if settings.weight in ("envgs", "additive"):
         ones = torch.ones_like(f0)
         return SpecularWeights(ones, torch.zeros_like(f0), ones)
     floor = settings.literal_cosine_floor if settings.weight == "literal" else settings.cosine_floor

@@ -9,7 +9,7 @@ from typing import Literal
 from rtgs.core.recipe import UNLESS_DEFAULT
 from rtgs.core.refuse import refuse_bad_numbers, refuse_unknown_words, refuse_unless
 
-Weight = Literal["microfacet", "literal", "split_sum", "envgs"]
+Weight = Literal["microfacet", "literal", "split_sum", "envgs", "blend", "additive"]
 Remap = Literal["pbrt", "none"]
 Masking = Literal["correlated", "separable"]
 Blend = Literal["srgb", "linear"]
@@ -20,7 +20,9 @@ Fresnel = Literal["schlick", "none", "dielectric", "conductor", "coated"]
 class OpticsSettings:
     """The weights in front of the traced colours (method.md 4.2 to 4.4; decisions 1 to 5)."""
 
-    # "literal": the paper's blend without the cosine; "split_sum": its ablation; "envgs": 1
+    # "literal": the paper's blend without the cosine; "split_sum": its ablation; "blend": w_r = 1, k_s alone says how
+    # much (3DGS-DR, EnvGS), written "envgs" in recipes, as ever, and good under both names; "additive": as well, and
+    # nothing is taken from C_d: C_d + k_s C_r.
     weight: Weight = "microfacet"
     # S_max, bound of the microfacet gain: 1 conserves energy and is nearly the same from all angles, 0 = no bound (the
     # paper); decision 5.
@@ -40,6 +42,8 @@ class OpticsSettings:
 
     def __post_init__(self) -> None:
         refuse_unknown_words(self, "method.optics")
+        if self.weight == "blend":  # one weight of two names: the older one is the key of what was trained
+            object.__setattr__(self, "weight", "envgs")
         if not (self.max_gain >= 0 and math.isfinite(self.max_gain)):
             raise ValueError(
                 f"method.optics.max_gain={self.max_gain} must be a finite number of at least 0 (0: no bound)"
@@ -53,9 +57,16 @@ class OpticsSettings:
                 raise ValueError(f"method.optics.{name}={getattr(self, name)} must be above 0 and at most 1")
 
     @property
+    def additive(self) -> bool:
+        """Whether C_d stays whole beside the reflection: no share 1 - k_s of it."""
+        return self.weight == "additive"
+
+    @property
     def at_most_one(self) -> bool:
-        """Whether w_r can never exceed 1: energy is conserved."""
-        return self.weight in ("split_sum", "envgs") or (self.weight == "microfacet" and 0 < self.max_gain <= 1)
+        """Whether w_r can never exceed 1; unless it is added, energy is conserved."""
+        return self.weight in ("split_sum", "envgs", "additive") or (
+            self.weight == "microfacet" and 0 < self.max_gain <= 1
+        )
 
 
 @dataclass(frozen=True)

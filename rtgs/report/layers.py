@@ -27,17 +27,23 @@ class LayerPixels:
 
 
 def layer_pixels(
-    layers: Mapping[str, Tensor], image: Tensor, photo: Tensor, camera: Camera, truth: ViewTruth | None
+    layers: Mapping[str, Tensor],
+    image: Tensor,
+    photo: Tensor,
+    camera: Camera,
+    truth: ViewTruth | None,
+    symbols: Mapping[str, str] | None = None,
 ) -> list[LayerPixels]:
     """Pictures of the layers of one view, in the order in which light is put together; empty without any.
 
     Args:
         layers: by name, all sRGB where they are colours: ``diffuse`` (3, H, W) the image without its reflection,
-            ``reflection`` (3, H, W) k_s w_r C_r, ``transmission`` (3, H, W) and its parts ``inner``, ``contents`` and
-            ``behind``, ``normal`` (3, H, W) world frame, ``specular`` (H, W) k_s, ``roughness`` (H, W) and ``f0``
-            (H, W) or (3, H, W). Absent ones are left out.
+            ``reflection`` (3, H, W), ``transmission`` (3, H, W) and its parts ``inner``, ``contents`` and ``behind``,
+            ``normal`` (3, H, W) world frame, ``specular`` (H, W), ``roughness`` (H, W) and ``f0`` (H, W) or (3, H, W).
+            Absent ones are left out.
         image: (3, H, W) the render.
         photo: (3, H, W).
+        symbols: :attr:`rtgs.methods.spec.MethodSpec.layers` of the method, for captions; None: they hold for all.
     """
     if not layers:
         return []
@@ -50,7 +56,7 @@ def layer_pixels(
             value = layers[name]
             shown[name] = alpha_picture(value) if value.ndim == 2 else to_bytes(value)
     pairs = [
-        LayerPixels(title, caption, shown.get(name), true.get(name))
+        LayerPixels(title, caption.said((symbols or {}).get(name)), shown.get(name), true.get(name))
         for name, (title, caption) in _TITLES.items()
         if name in shown or (name in true and name == "transmission")
     ]
@@ -58,18 +64,39 @@ def layer_pixels(
     return [*pairs, final]
 
 
+@dataclass(frozen=True)
+class _Caption:
+    """What a layer shows, whatever the method, and what its truth is."""
+
+    shows: str
+    truth: str = ""
+
+    def said(self, symbols: str | None) -> str:
+        """With what the layer is in a method's own symbols."""
+        whole = ": ".join(part for part in (self.shows, symbols) if part)
+        return f"{whole}; truth: {self.truth}" if self.truth else whole
+
+
+_SCALE = "0 black, 1 white"
 _TITLES = {
-    "diffuse": ("Diffuse", "what the base set adds to the image, (1 − k_s) C_d; truth: diffuse light, sRGB encoded"),
-    "reflection": ("Reflection", "k_s w_r C_r; truth: specularly reflected light, sRGB encoded"),
-    "transmission": ("Transmission", "k_s w_t C_t; truth: light through the first surface, sRGB encoded"),
-    "inner": ("Inner", "part of the transmission: mirrored inside the glass"),
-    "contents": ("Contents", "part of the transmission: straight from what is inside the glass"),
-    "behind": ("Behind", "part of the transmission: straight through the glass"),
-    "normal": ("Normal", "camera frame: red right, green up, blue towards the viewer"),
-    "specular": ("Specular k_s", "0 black, 1 white; truth: specular objects"),
-    "roughness": ("Roughness", "0 black, 1 white"),
-    "f0": ("f0", "reflectance at normal incidence, 0 black, 1 white"),
+    "diffuse": ("Diffuse", _Caption("what the base set adds to the image", "diffuse light, sRGB encoded")),
+    "reflection": ("Reflection", _Caption("what mirrored light adds", "specularly reflected light, sRGB encoded")),
+    "transmission": (
+        "Transmission",
+        _Caption("what light through the object adds", "light through the first surface, sRGB encoded"),
+    ),
+    "inner": ("Inner", _Caption("part of the transmission: mirrored inside the glass")),
+    "contents": ("Contents", _Caption("part of the transmission: straight from what is inside the glass")),
+    "behind": ("Behind", _Caption("part of the transmission: straight through the glass")),
+    "normal": ("Normal", _Caption("camera frame: red right, green up, blue towards the viewer")),
+    "specular": ("Specular", _Caption(_SCALE, "specular objects")),
+    "roughness": ("Roughness", _Caption(_SCALE)),
+    "f0": ("f0", _Caption(f"reflectance at normal incidence, {_SCALE}")),
 }
+
+
+NAMES = tuple(_TITLES)
+"""Of layers with a title, in their order."""
 
 
 def _truth_pixels(truth: ViewTruth | None, camera: Camera) -> dict[str, np.ndarray]:

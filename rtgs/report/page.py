@@ -81,6 +81,7 @@ class ReportView:
     alpha: Tensor | None = None  # (H, W)
     mask: Tensor | None = None  # (H, W) bool, where the masked figures are measured; outlined in the error map
     layers: Mapping[str, Tensor] = field(default_factory=dict)  # as rtgs.report.layers.layer_pixels takes them
+    symbols: Mapping[str, str] = field(default_factory=dict)  # likewise
     truth: ViewTruth | None = None  # of path-traced captures
     framed: Tensor | None = None  # (H, W) training views that show what the pixel shows
 
@@ -307,7 +308,8 @@ def _panel(view: ReportView, score: ViewScore, drawn: list[_Drawn], long_side: i
 
 def _layer_figures(view: ReportView, long_side: int, quality: int) -> tuple[LayerFigure, ...]:
     figures = []
-    for layer in layer_pixels(view.layers, view.render, view.photo, view.camera, view.truth):
+    seen = (view.layers, view.render, view.photo, view.camera, view.truth)
+    for layer in layer_pixels(*seen, view.symbols):
         both = ((layer.rendered, "rendered"), (layer.truth, "truth"))
         rendered, truth = (
             None if pixels is None else _encoded(pixels, Picture("", f"{layer.title}, {kind}"), long_side // 2, quality)

@@ -13,7 +13,7 @@ from torch import Tensor
 from rtgs.core.cameras import Camera
 from rtgs.core.errors import RtgsError
 from rtgs.evaluate.images import to_bytes
-from rtgs.evaluate.layers import added_by_base
+from rtgs.evaluate.layers import BASE, added_by_base
 from rtgs.report.figures import DepthPicture, depth_picture, normal_picture
 
 SHOWN = ("final", "diffuse", "reflection", "transmission", "normal", "depth", "weights")
@@ -63,7 +63,8 @@ def shown_layer(name: str, maps: Mapping[str, Tensor], camera: Camera, depths: D
 
     ``final`` is the image; ``diffuse`` what the base set adds to it, (1 - k_s) C_d; ``reflection`` k_s w_r C_r and
     ``transmission`` k_s w_t C_t, what the rays add; ``normal`` in the camera's frame; ``depth`` over disparity, near
-    warm; ``weights`` red k_s w_r, green 1 - k_s, blue k_s w_t (method.md 3.3).
+    warm; ``weights`` red k_s w_r, green 1 - k_s, blue k_s w_t (method.md 3.3). Other methods have weights of their
+    own; green is 1 where the reflection takes nothing from the base set.
 
     Args:
         maps: ``image`` (3, H, W), ``depth`` and ``alpha`` (H, W), ``normal`` (3, H, W) world, and the layers by name.
@@ -79,7 +80,7 @@ def shown_layer(name: str, maps: Mapping[str, Tensor], camera: Camera, depths: D
         return _depth(maps, depths)
     if name == "weights":
         passed = maps.get("transmission_weight")
-        own = 1 - maps["specular"]
+        own = torch.ones_like(maps["specular"]) if BASE in maps else 1 - maps["specular"]
         return to_bytes(
             torch.stack((maps["reflection_weight"], own, torch.zeros_like(own) if passed is None else passed))
         )

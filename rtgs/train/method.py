@@ -77,7 +77,8 @@ class RenderedView:
     - ``layers``, image = (1 - specular) diffuse + reflection + transmission where ``traced``: ``diffuse``
       C_d; ``reflection`` k_s w_r C_r and ``transmission`` k_s w_t C_t, 0 where no ray was traced; ``reflected_color``
       C_r and ``transmitted_color`` C_t; ``specular``, ``roughness``, ``f0`` as composited; ``traced``, bool. With
-      ``weights`` also ``reflection_weight`` k_s w_r and ``transmission_weight`` k_s w_t, (H, W), means over colours.
+      ``weights`` also ``reflection_weight`` k_s w_r and ``transmission_weight`` k_s w_t, (H, W), means over colours:
+      what ``reflected_color`` and ``transmitted_color`` are multiplied with.
       Methods that add the reflection without taking from C_d have ``base``, what is left of the image without it, and
       ``diffuse`` is the same.
     """

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 FINAL = "final"
 OWN = "diffuse"
 """The layer of the base set: (1 - k_s) C_d, or the layer ``base`` of methods that add their reflection."""
-_REFLECTION = "reflection"  # of methods that look it up in a cubemap it has no map of weights
+_REFLECTION = "reflection"  # of other people's methods it may have no map of weights
 
 
 @dataclass(frozen=True)

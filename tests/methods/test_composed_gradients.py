@@ -84,7 +84,9 @@ def twin_render(method: Model, base, reflection, camera, images, texels=None) ->
         color = color + (1 - traced.alpha[:, None]) * scene_color("mean", images).double()
     if texels is not None:
         color = color + (1 - traced.alpha[:, None]) * CubemapLight(texels, settings.environment)(mirrored.directions)
-    change = torch.where(covered, specular_change(flat, weight * color.T, None), 0.0)
+    light = weight * color.T
+    change = flat.specular * light if settings.optics.weight == "additive" else specular_change(flat, light, None)
+    change = torch.where(covered, change, 0.0)
     image = (flat.diffuse + change).reshape(3, camera.height, camera.width)
     fragile = discontinuity_mask(*shape, features, camera, options=options).flatten()
     fragile |= fragile_rays(*traced_shape, mirrored.origins, mirrored.directions, **colors, options=trace)
@@ -109,6 +111,7 @@ CASES = {
     "conductor": (OpticsSettings(fresnel="conductor", edge_tint=0.7), MaterialSettings(specular=0.3, f0=0.6)),
     "dielectric": (OpticsSettings(fresnel="dielectric"), MaterialSettings(specular=0.3, f0=0.1, f0_channels=3)),
     "envgs": (OpticsSettings(weight="envgs"), MaterialSettings(specular=0.3)),
+    "additive": (OpticsSettings(weight="additive"), MaterialSettings(specular=0.3)),
     "background": (OpticsSettings(weight="envgs"), MaterialSettings(specular=0.3)),
     "cubemap": (OpticsSettings(weight="envgs"), MaterialSettings(specular=0.3)),
 }

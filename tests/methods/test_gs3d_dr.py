@@ -25,6 +25,7 @@ from rtgs.methods.gs3d_dr import DeferredSettings
 from rtgs.methods.model import Model
 from rtgs.methods.parts.cubemap_mirror import WEIGHT
 from rtgs.methods.settings import MethodSettings
+from rtgs.report.shown import layers_of
 from rtgs.train.seeds import generator_for
 from rtgs.train.settings import LossSettings, ScheduleSettings
 
@@ -75,7 +76,7 @@ def test_the_image_is_its_equation(primitive: str):
     camera = made.scene.test[0].camera
     with torch.no_grad():
         method["base"].gaussians[WEIGHT].add_(4.0)
-        found = method.render(camera, 60, Mode.EVALUATE, RenderOptions(normal=True, layers=True))
+        found = method.render(camera, 60, Mode.EVALUATE, RenderOptions(normal=True, layers=True, weights=True))
     features, normal = found.buffers.features.double(), found.buffers.normal.double()
     view = camera.rays(torch.float64).directions.permute(2, 0, 1)
     view = view / view.norm(dim=0)
@@ -90,7 +91,10 @@ def test_the_image_is_its_equation(primitive: str):
     torch.testing.assert_close(found.image.double(), expected, atol=2e-4, rtol=0)
     layers = found.layers
     assert layers is not None
-    assert set(layers) == {"diffuse", "reflection", "reflected_color", "specular"}
+    assert set(layers) == {"diffuse", "reflection", "reflected_color", "specular", "reflection_weight"}
+    torch.testing.assert_close(layers["reflection_weight"] * layers["reflected_color"], layers["reflection"])
+    assert layers["reflection_weight"].data_ptr() != layers["specular"].data_ptr(), "files hold no tensor twice"
+    assert "weights" in layers_of({"image": found.image, **layers})
     torch.testing.assert_close((1 - layers["specular"]) * layers["diffuse"] + layers["reflection"], found.image)
 
 

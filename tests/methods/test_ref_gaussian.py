@@ -36,6 +36,7 @@ from rtgs.methods.shading.split_sum import mean_normal, mirrored
 from rtgs.optics.split_sum import lobe_factors, split_sum_factors
 from rtgs.render.discontinuities.surfels import discontinuity_mask
 from rtgs.render.reference import surfels as reference
+from rtgs.report.shown import layers_of
 from rtgs.train.seeds import generator_for
 from tests.mesh.shapes import sphere
 
@@ -323,10 +324,19 @@ def test_without_indirect_light_there_is_none_of_it():
     assert not any(name in method["base"].gaussians for name in INDIRECT)
     assert not [name for name in method.state() if name.startswith("visibility")]
     with torch.no_grad():
-        found = method.render(made.scene.test[0].camera, 60, Mode.EVALUATE, RenderOptions(normal=True, layers=True))
+        wanted = RenderOptions(normal=True, layers=True, weights=True)
+        found = method.render(made.scene.test[0].camera, 60, Mode.EVALUATE, wanted)
     layers = found.layers
     assert layers is not None
-    assert set(layers) == {"diffuse", "reflection", "reflected_color", "specular", "roughness", "f0"}
+    names = {"diffuse", "reflection", "reflected_color", "specular", "roughness", "f0", "reflection_weight"}
+    assert set(layers) == names
+    weight, color = layers["reflection_weight"], layers["reflected_color"]
+    lit = color.amin(0) > 1e-3
+    share = (layers["reflection"] / color.clamp_min(1e-3)).mean(0)
+    torch.testing.assert_close(weight[lit], share[lit], atol=1e-5, rtol=1e-4)
+    assert float(weight.max()) > 0.02, "something reflects"
+    assert float((weight - found.buffers.alpha).max()) <= 1e-5, "no more than is covered"
+    assert "weights" in layers_of({"image": found.image, **layers})
     whole = (1 - layers["specular"]) * layers["diffuse"] + layers["reflection"]
     torch.testing.assert_close(whole, found.image)
 

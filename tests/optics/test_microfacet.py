@@ -13,6 +13,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rtgs.core.recipe import canonical_json
 from rtgs.optics.microfacet import (
     ggx_distribution,
     inverse_gain,
@@ -121,6 +122,8 @@ def test_the_weights_at_points_worked_out_by_hand():
     assert float(literal.reflection) == pytest.approx(31_500, rel=0.01)
     envgs = specular_weights(f64(0.3), f64(0.2), f64(0.1), OpticsSettings(weight="envgs"))
     assert (float(envgs.reflection), float(envgs.transmission)) == (1.0, 0.0)
+    additive = specular_weights(f64(0.3), f64(0.2), f64(0.1), OpticsSettings(weight="additive"))
+    assert (float(additive.reflection), float(additive.transmission)) == (1.0, 0.0)
     assert float(dielectric.transmission) == pytest.approx(0.96)
     for alpha in np.geomspace(0.05, 1, 9):
         bounded, free = (
@@ -133,7 +136,18 @@ def test_the_weights_at_points_worked_out_by_hand():
 def test_only_weights_that_conserve_energy_are_known_to_stay_below_one():
     open_gains = (replace(DEFAULT, max_gain=16.0), replace(DEFAULT, max_gain=0.0), OpticsSettings(weight="literal"))
     assert not any(optics.at_most_one for optics in open_gains)
-    assert OpticsSettings(weight="envgs", max_gain=16.0).at_most_one
+    for weight in ("envgs", "blend", "additive"):
+        assert OpticsSettings(weight=weight, max_gain=16.0).at_most_one
+
+
+def test_blend_is_the_weight_that_recipes_call_envgs():
+    both = [OpticsSettings(weight=weight) for weight in ("blend", "envgs")]
+    assert both[0] == both[1]
+    assert canonical_json(both[0]) == canonical_json(both[1])
+    assert '"weight":"envgs"' in canonical_json(both[0])
+    assert replace(DEFAULT, weight="blend") == both[0]
+    assert OpticsSettings(weight="additive") != both[0]
+    assert [each.additive for each in (DEFAULT, *both, OpticsSettings(weight="additive"))] == [False] * 3 + [True]
 
 
 def test_literal_diverges_where_the_cosine_form_does_not():
@@ -257,7 +271,8 @@ def test_nothing_is_ever_nan_and_gradients_are_bounded(cosine: float, alpha: flo
     [
         (
             {"weight": "ggx"},
-            "method.optics.weight='ggx' is unknown: choose one of microfacet, literal, split_sum, envgs",
+            "method.optics.weight='ggx' is unknown: choose one of microfacet, literal, split_sum, envgs, blend, "
+            "additive",
         ),
         ({"masking": "none"}, "method.optics.masking='none' is unknown: choose one of correlated, separable"),
         ({"max_gain": math.inf}, "method.optics.max_gain=inf"),

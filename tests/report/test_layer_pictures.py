@@ -5,7 +5,9 @@ from dataclasses import replace
 import torch
 
 from rtgs.core.cameras import Camera
-from rtgs.report.layers import layer_pixels
+from rtgs.methods.registry import find_method, own_methods
+from rtgs.methods.spec import FAR_LIGHT, MIRROR
+from rtgs.report.layers import NAMES, layer_pixels
 from rtgs.scenes.truth import ViewTruth
 
 SIZE = (32, 48)
@@ -37,14 +39,14 @@ def camera() -> Camera:
 def test_each_layer_stands_beside_its_truth():
     photo = torch.rand(3, *SIZE)
     found = {item.title: item for item in layer_pixels(layers(), photo, photo, camera(), truth())}
-    assert list(found) == ["Diffuse", "Reflection", "Normal", "Specular k_s", "Roughness", "f0", "Final"]
+    assert list(found) == ["Diffuse", "Reflection", "Normal", "Specular", "Roughness", "f0", "Final"]
     diffuse, final = found["Diffuse"], found["Final"]
     assert diffuse.rendered is not None
     assert diffuse.truth is not None
     assert abs(int(diffuse.rendered[0, 0, 0]) - int(diffuse.truth[0, 0, 0])) <= 1  # sRGB of 0.214 is one half
     assert final.rendered is not None
     assert (final.rendered == final.truth).all()
-    normal, specular = found["Normal"], found["Specular k_s"]
+    normal, specular = found["Normal"], found["Specular"]
     assert normal.truth is not None
     assert (normal.rendered == normal.truth).all()
     assert specular.truth is not None
@@ -88,3 +90,33 @@ def test_parts_of_the_light_through_glass_are_shown_where_a_method_renders_them(
     assert unknown["Inner"].truth is None
     silent = [item.title for item in layer_pixels(layers(), photo, photo, camera(), parts)]
     assert silent == [item.title for item in layer_pixels(layers(), photo, photo, camera(), whole)]
+
+
+def test_captions_are_in_the_symbols_of_the_method_that_made_the_layers():
+    photo = torch.rand(3, *SIZE)
+
+    def captions(method: str) -> dict[str, str]:
+        symbols = find_method(method).layers
+        return {each.title: each.caption for each in layer_pixels(layers(), photo, photo, camera(), truth(1), symbols)}
+
+    traced, blended, metal, scoped = (captions(name) for name in ("rtgs", "3dgs_dr", "ref_gaussian", "ref_gs"))
+    assert traced["Diffuse"] == "what the base set adds to the image: (1 − k_s) C_d; truth: diffuse light, sRGB encoded"
+    assert "k_s w_t C_t" in traced["Transmission"]
+    assert blended["Reflection"].startswith("what mirrored light adds: m C_r; truth")
+    assert "metalness" in metal["Specular"]
+    assert "inside of the scope" in scoped["Specular"]
+    assert (
+        captions("gaussian_shader")["Specular"]
+        == "0 black, 1 white: tint, mean of its colours; truth: specular objects"
+    )
+    plain = {each.title: each.caption for each in layer_pixels(layers(), photo, photo, camera(), None)}
+    assert not any(symbol in text for text in plain.values() for symbol in ("k_s", "w_r", "C_d"))
+    for other in (blended, metal, scoped):
+        assert not any("k_s" in text for text in other.values()), "the symbols of methods that trace"
+
+
+def test_every_method_with_a_reflection_says_what_its_layers_are():
+    for spec in own_methods():
+        if spec.has & {MIRROR, FAR_LIGHT}:
+            assert {"diffuse", "reflection", "specular"} <= spec.layers.keys(), spec.name
+        assert spec.layers.keys() <= set(NAMES), spec.name

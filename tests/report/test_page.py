@@ -352,6 +352,9 @@ def test_layers_stand_beside_their_truth() -> None:
     assert page.count("Enlarge Reflection, rendered") == page.count("Enlarge Reflection, truth") == 1
     assert "Enlarge Roughness, truth" not in page
     assert "sRGB encoded" in " ".join(outline(page).text)
+    told = render_report(ReportData("x", table(), views=(replace(view, symbols={"reflection": "m C_r"}),)))
+    assert "m C_r" in " ".join(outline(told).text)
+    assert "C_r" not in " ".join(outline(page).text)
 
 
 def test_links_lead_to_what_lies_beside_the_page_and_are_renewed(tmp_path: Path) -> None:

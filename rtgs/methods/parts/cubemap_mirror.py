@@ -107,6 +107,8 @@ class CubemapMirror(Part):
             shown = {"diffuse": diffuse, "reflection": weight * color, "reflected_color": color}
             layers = {name: value.detach().reshape(shape) for name, value in shown.items()}
             layers["specular"] = specular.detach()
+            if frame.options.weights:
+                layers["reflection_weight"] = layers["specular"].clone()  # files hold no tensor twice
         return RenderedView(camera, image, buffers, layers, {"specular": specular}, observations=raster.observations)
 
     # ---- what it decides about the base set

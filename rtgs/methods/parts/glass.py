@@ -236,7 +236,7 @@ class Glass(Part):
             passed.first_bounce,
             (*met.observations, *passed.observations),
         )
-        return lit_view(frame, raster, traced, self.settings.optics.blend)
+        return lit_view(frame, raster, traced, self.settings.optics)
 
     def _sample(self, shown: GlassView, scatter: Scatter | None) -> tuple[Reflected, Transmission, tuple[Light, ...]]:
         """What one ray of each kind meets behind each traced pixel, and the lights of it; ``scatter``: rough walls."""

@@ -1,7 +1,7 @@
 """The reflection set: one mirror ray per pixel, traced through a set of its own (method.md 3.3, 6.1, 6.2).
 
-image = (1 - k_s) C_d + k_s w_r C_r. Parts after this one may use its steps (surface, choose, reflect) for lights of
-their own.
+image = (1 - k_s) C_d + k_s w_r C_r, or with additive weights C_d + k_s C_r. Parts after this one may use its steps
+(surface, choose, reflect) for lights of their own.
 """
 
 from __future__ import annotations
@@ -190,7 +190,7 @@ class Mirror(Part):
         met = self.reflect(frame, chosen, flat)
         lights = self.lights(met, reflected_weight(met.rays.cosine, met.pixels, self.settings.optics))
         traced = Traced(flat, chosen, met.pixels, lights, observations=met.observations)
-        return lit_view(frame, raster, traced, self.settings.optics.blend)
+        return lit_view(frame, raster, traced, self.settings.optics)
 
     def surface(self, buffers: RasterBuffers) -> SurfacePixels:
         """Every pixel of the view, flattened."""

@@ -161,9 +161,14 @@ class SplitSumMirror(CubemapMirror):
         free = self._free(frame, raster, directions)
         direct = light(directions, pixels.roughness).T
         color = arriving(direct, pixels.indirect, free)
-        specular = alpha * specular_weight(pixels, cosine) * color
+        weight = alpha * specular_weight(pixels, cosine)
+        specular = weight * color
         shape = (3, frame.camera.height, frame.camera.width)
-        layers = self._layers(pixels, specular, color, free, shape) if frame.options.layers else None
+        layers = None
+        if frame.options.layers:
+            layers = self._layers(pixels, specular, color, free, shape)
+            if frame.options.weights:
+                layers["reflection_weight"] = weight.detach().mean(0).reshape(shape[1:])
         maps = {"specular": pixels.metalness.reshape(shape[1:])}
         image = shaded(pixels, specular).reshape(shape)
         return RenderedView(frame.camera, image, buffers, layers, maps, observations=raster.observations)

@@ -1,5 +1,7 @@
 """From traced lights to the image: C = (1 - k_s) C_d + k_s sum of w C over the lights (method.md 3.3).
 
+With ``method.optics.weight`` "additive" it is C_d + k_s sum of w C.
+
 A light is what one kind of ray met: light reflected by the surface, light that passed through it. Any part makes
 lights; they are blended here, in the space that ``method.optics.blend`` names, and become layers of their own.
 """
@@ -17,6 +19,7 @@ from rtgs.methods.shading.mirror import SurfacePixels, specular_change
 from rtgs.methods.shading.pixel_maps import full_map, full_view, surface_layers
 from rtgs.methods.shading.traced_pixels import TracedPixels
 from rtgs.optics.light import decoded, encoded
+from rtgs.optics.settings import OpticsSettings
 from rtgs.train.method import Observation, RenderedView
 
 
@@ -70,14 +73,17 @@ def mean_of_lights(samples: Sequence[Sequence[Light]]) -> tuple[Light, ...]:
     return tuple(found)
 
 
-def lit_view(frame: Frame, raster: Raster, traced: Traced, blend: str) -> RenderedView:
+def lit_view(frame: Frame, raster: Raster, traced: Traced, optics: OpticsSettings) -> RenderedView:
     """The view with its lights; the image of pixels that were not traced is C_d."""
-    camera, flat, chosen, pixels = frame.camera, traced.flat, traced.chosen, traced.pixels
-    change = specular_change(pixels, sum_of_lights(traced.lights, blend), chosen.emphasis, blend)
+    camera, flat, chosen, pixels, blend = frame.camera, traced.flat, traced.chosen, traced.pixels, optics.blend
+    lights = sum_of_lights(traced.lights, blend)
+    change = specular_change(pixels, lights, chosen.emphasis, blend, additive=optics.additive)
     shape = (3, camera.height, camera.width)
     layers = None
     if frame.options.layers:
         layers = surface_layers(flat, chosen, shape)
+        if optics.additive:
+            layers["base"] = layers["diffuse"].clone()  # files hold no tensor twice
         for light in traced.lights:
             shown = encoded(pixels.specular * light.weight * decoded(light.color, blend), blend)
             layers[light.name] = full_map(shown.detach(), chosen, shape)
