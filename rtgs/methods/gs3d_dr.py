@@ -60,14 +60,14 @@ def build(setup: Setup) -> Model:
     if not surfels:  # their normals are composited, but no depth goes with them
         refuse_surface_losses(setup.settings, ("normal", "distortion"))
     base = BaseSet(setup, SURFELS if surfels else ELLIPSOIDS)
-    mirror = CubemapMirror(setup, base, own.weight_floor)
     terms = (*surface_terms(setup), *mcmc_terms(base, setup))
     if not own.scoped:
-        return Model(setup, (base, mirror), terms)
+        return Model(setup, (base, CubemapMirror(setup, base, own.weight_floor)), terms)
     if own.outside == 0:
         idle = Decision("no scope, all may reflect", "method.own.outside=0: there is no loss outside of it")
-        return Model(setup, (base, mirror), (*terms, idle))
+        return Model(setup, (base, CubemapMirror(setup, base, own.weight_floor)), (*terms, idle))
     held = ScopeHolder(setup, base, own, WEIGHT, weight_of)
+    mirror = CubemapMirror(setup, base, own.weight_floor, where=held)
     return Model(setup, (base, held, mirror), (*terms, scope_term(base, own, held)))
 
 
@@ -98,7 +98,7 @@ _DIFFUSE, _LIT = cubemap_stages("primitive")
 # Without MIRROR: what ablations take away there is the traced set.
 SPEC = MethodSpec(
     "3dgs_dr",
-    (_DIFFUSE, replace(_LIT, version=2)),
+    (_DIFFUSE, replace(_LIT, version=3)),
     build,
     frozenset({HARMONICS, FAR_LIGHT, PROPAGATION, SABOTAGE}),
     own=DeferredSettings,

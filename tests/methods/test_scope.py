@@ -9,16 +9,22 @@ import pytest
 import torch
 
 from rtgs.core.errors import RtgsError
+from rtgs.gaussians.density import logit
 from rtgs.mesh.silhouettes import MaskView, enclosing_sphere
 from rtgs.methods import Mode
 from rtgs.methods.gs3d_dr import DeferredSettings
-from rtgs.methods.parts.cubemap_mirror import WEIGHT
+from rtgs.methods.model import Model
+from rtgs.methods.parts.cubemap_mirror import WEIGHT, CubemapMirror
 from rtgs.methods.ref_gs import FeatureSettings
 from rtgs.methods.scope import Scope, ScopeSettings, scope_of
-from tests.methods.reflective_cases import MirrorScene, new_method, recipe, schedule, tiny, train_all
+from rtgs.methods.settings import MethodSettings
+from tests.methods.reflective_cases import MirrorScene, new_method, recipe, schedule, tiny, train_all, train_step
 
 MIDDLE, RADIUS = (0.1, -0.05, 0.0), 0.4
 MASKS = {"scope": "masks"}
+WIDE = 0.8  # radius of a scope with many Gaussians inside and outside
+TYPED = {"scope_radius": WIDE, "scope_center": list(MIDDLE)}
+FLOOR = 0.3  # of m at resets
 
 
 def mask_of(camera, center=MIDDLE, radius=RADIUS) -> torch.Tensor:
@@ -29,10 +35,11 @@ def mask_of(camera, center=MIDDLE, radius=RADIUS) -> torch.Tensor:
     return (offset - (along @ offset)[..., None] * along).norm(dim=-1) <= radius
 
 
-def masked(made: MirrorScene | None = None, every: int = 1) -> MirrorScene:
+def masked(made: MirrorScene | None = None, every: int = 1, radius: float = RADIUS) -> MirrorScene:
     made = made or tiny()
     train = [
-        replace(view, mask=mask_of(view.camera) if k % every == 0 else None) for k, view in enumerate(made.scene.train)
+        replace(view, mask=mask_of(view.camera, radius=radius) if k % every == 0 else None)
+        for k, view in enumerate(made.scene.train)
     ]
     return replace(made, scene=replace(made.scene, train=type(made.scene.train)(train)))
 
@@ -149,3 +156,91 @@ def test_3dgs_dr_pulls_down_what_the_masks_do_not_enclose():
     bare = train_all(replace(plain, own=MASKS), tiny(), schedule(opacity_reset_every=0))
     terms = bare.losses(bare.render(view.camera, 59, Mode.TRAIN), view, 59).terms
     assert "outside" not in [term.name for term in terms]
+
+
+# ---- 3DGS-DR acts inside alone: what is published leaves everything outside as it is
+
+
+def deferred(own: dict) -> MethodSettings:
+    plain = replace(recipe("3dgs_dr"), loss=replace(recipe().loss, normal=0.0))
+    return replace(plain, own={**own, "weight_floor": FLOOR})
+
+
+def begun(settings: MethodSettings, made: MirrorScene) -> Model:
+    """In its second stage; of any m and opacity there are Gaussians inside and outside."""
+    method = new_method(settings, made, schedule())
+    for stage in method.stages:
+        method.begin(stage)
+    gaussians = method["base"].gaussians
+    generator = torch.Generator().manual_seed(2)
+    with torch.no_grad():
+        gaussians[WEIGHT].copy_(8 * torch.rand(len(gaussians), generator=generator) - 7)
+        gaussians.opacity_logits.copy_(8 * torch.rand(len(gaussians), generator=generator) - 3)
+    return method
+
+
+def changed(before: dict[str, torch.Tensor], method: Model) -> dict[str, torch.Tensor]:
+    """(N,) bool by name: the rows of which some bit is another."""
+    rows = {name: (before[name] != value.detach()) for name, value in method["base"].gaussians.items()}
+    return {name: each.flatten(1).any(1) if each.ndim > 1 else each for name, each in rows.items()}
+
+
+@pytest.mark.parametrize("own", [TYPED, MASKS], ids=["typed", "masks"])
+@pytest.mark.parametrize("primitive", ["ellipsoids", "surfels"])
+def test_3dgs_dr_propagates_and_resets_inside_alone(own: dict, primitive: str):
+    made = masked(radius=WIDE)
+    method = begun(deferred({**own, "primitive": primitive}), made)
+    scope, _ = scope_of(ScopeSettings(**own), made.scene)
+    mirror, gaussians = method.parts["mirror"], method["base"].gaussians
+    assert scope is not None
+    assert isinstance(mirror, CubemapMirror)
+    inside = scope.holds(gaussians.means.detach())
+    assert 20 < int(inside.sum()) < len(inside) - 20
+    before = {name: value.detach().clone() for name, value in gaussians.items()}
+    value, opacity = before[WEIGHT].sigmoid(), before["opacity_logits"]
+    (event,) = mirror.control(24)
+    expected = {"opacity_logits": opacity < logit(0.9), "log_scales": value >= 0.02, "sh_dc": value <= 0.05}
+    found = changed(before, method)
+    for name, rows in found.items():
+        assert torch.equal(rows, inside & expected[name] if name in expected else torch.zeros_like(inside)), name
+        assert name not in expected or bool((expected[name] & ~inside).any()), f"{name}: outside it would have changed"
+    grown, disturbed = (int((inside & expected[name]).sum()) for name in ("log_scales", "sh_dc"))
+    assert event.detail == f"normals propagated: {grown} surfels grown, colours of {disturbed} disturbed"
+    before = {name: each.detach().clone() for name, each in gaussians.items()}
+    mirror.after_reset()
+    found = changed(before, method)
+    assert torch.equal(found.pop(WEIGHT), inside & (value < FLOOR))
+    assert not any(bool(rows.any()) for rows in found.values())
+
+
+def test_without_a_scope_3dgs_dr_propagates_everywhere():
+    method = begun(deferred({}), tiny())
+    gaussians = method["base"].gaussians
+    before = {name: value.detach().clone() for name, value in gaussians.items()}
+    mirror = method.parts["mirror"]
+    assert isinstance(mirror, CubemapMirror)
+    list(mirror.control(24))
+    assert torch.equal(changed(before, method)["opacity_logits"], before["opacity_logits"] < logit(0.9))
+    mirror.after_reset()
+    assert torch.equal(changed(before, method)[WEIGHT], before[WEIGHT].sigmoid() < FLOOR)
+
+
+@pytest.mark.parametrize("own", [TYPED, MASKS], ids=["typed", "masks"])
+def test_a_resumed_3dgs_dr_propagates_and_resets_inside_bit_for_bit(own: dict):
+    """Propagations before steps 36 and 48 and a reset before 40 follow; masks are those of the first training."""
+    made = masked(radius=WIDE)
+    method = new_method(deferred(own), made, schedule())
+    other = new_method(method.settings, masked(every=3, radius=WIDE), schedule())
+    for stage in method.stages:
+        method.begin(stage)
+    for step in range(15, 33):
+        train_step(method, made, step)
+    other.load({name: tensor.clone() for name, tensor in method.state().items()})
+    kinds = []
+    for step in range(33, 50):
+        kinds += [event.kind for event in train_step(method, made, step)[1]]
+        train_step(other, made, step)
+    assert (kinds.count("propagation"), kinds.count("opacity_reset")) == (2, 1)
+    expected, found = method.state(), other.state()
+    assert found.keys() == expected.keys()
+    assert [name for name in expected if not torch.equal(found[name], expected[name])] == []

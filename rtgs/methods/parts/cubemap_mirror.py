@@ -1,6 +1,7 @@
 """The reflection of 3DGS-DR (Ye et al., SIGGRAPH 2024): a composited weight m, one lookup in a cubemap a pixel.
 
-image = (1 - m) C_d + m C_r. Normals are propagated from where they are right (method.md 6.1, in EnvGS's numbers).
+image = (1 - m) C_d + m C_r. Normals are propagated from where they are right (method.md 6.1, in EnvGS's numbers);
+where reflection has a scope, inside of it alone.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from rtgs.train.method import RenderedView, RenderOptions, Stage, StepEvent
 from rtgs.train.parameters import ParameterGroup
 
 if TYPE_CHECKING:
+    from rtgs.methods.parts.scope import ScopeHolder
     from rtgs.methods.spec import Setup
 
 WEIGHT = "specular_logits"  # of the channel m of 3DGS-DR: rate, files and propagation know it by the name of k_s
@@ -40,9 +42,17 @@ class CubemapMirror(Part):
     name = "mirror"
     weight = WEIGHT  # the channel that says how much a Gaussian reflects
 
-    def __init__(self, setup: Setup, base: BaseSet, weight_floor: float, stage: str = "reflection") -> None:
-        """``weight_floor``: m is raised to it at every reset of opacities."""
+    def __init__(
+        self,
+        setup: Setup,
+        base: BaseSet,
+        weight_floor: float,
+        stage: str = "reflection",
+        where: ScopeHolder | None = None,
+    ) -> None:
+        """``weight_floor``: m is raised to it at every reset of opacities; ``where``: what may reflect, None: all."""
         self.base = base
+        self.where = where
         self.settings = setup.settings
         self.generator = setup.generator
         # There is no traced set to reset, and no scene is judged matte.
@@ -123,14 +133,20 @@ class CubemapMirror(Part):
     def reset_due(self, following: int) -> bool:
         return base_reset_due(self.plan, following)
 
+    def inside(self) -> Tensor | None:
+        """(N,) bool: the Gaussians that may reflect; None: all, there is no scope or none yet."""
+        scope = None if self.where is None else self.where.scope
+        return None if scope is None else scope.holds(self.base.set.gaussians.means.detach())
+
     def after_reset(self) -> None:
-        """m becomes at least its floor: what has lost its reflection gets another chance."""
-        raise_specular(self.base.set, self._floor, self.weight)
+        """m becomes at least its floor: what has lost its reflection gets another chance, inside of the scope."""
+        raise_specular(self.base.set, self._floor, self.weight, self.inside())
 
     def control(self, following: int) -> Iterator[StepEvent]:
-        """Propagation of the base set's normals."""
+        """Propagation of the base set's normals, inside of the scope."""
         if self.environment.group is not None and propagation_due(self.plan, self._reflection, following):
-            yield propagate_normals(self.base.set, self._reflection.propagation, self.generator)
+            settings = self._reflection.propagation
+            yield propagate_normals(self.base.set, settings, self.generator, self.weight, inside=self.inside())
 
     # ---- state
 
