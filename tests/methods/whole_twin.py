@@ -121,8 +121,9 @@ class Twin:
             drawn = rasterize_ellipsoids(*shape, columns, camera, background=behind, options=options)
             found = RasterBuffers(drawn.features[:-3], drawn.alpha, drawn.depth, normal=drawn.features[-3:])
             fragile = ellipsoid_discontinuity_mask(*shape, columns, camera, options=options, bands=BANDS)
-        assert found.normal is not None
-        return found, fragile | (found.normal.detach().norm(dim=0) < SHORT * found.alpha.detach())
+        if found.normal is not None:  # what is shaded row by row has none, unless a loss asks for it
+            fragile |= found.normal.detach().norm(dim=0) < SHORT * found.alpha.detach()
+        return found, fragile
 
     def losses(self, shown: RenderedView, view: View) -> Terms:
         """Every term, as far as the weights ask for it."""
