@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import pytest
 import torch
 from reflective_cases import new_method, recipe, schedule, tiny, training_maps
 from torch import Tensor
+from whole_twin import BANDS, MCMC, Terms, Twin, begun, compare, scene
 
+from rtgs.core.cameras import Camera
 from rtgs.gaussians.materials import activate_materials
 from rtgs.gaussians.settings import MaterialSettings
 from rtgs.gaussians.surfels import activate
@@ -27,21 +30,28 @@ from rtgs.methods.shading.mirror import (
     surface_pixels,
 )
 from rtgs.optics.settings import OpticsSettings
-from rtgs.render.discontinuities.surfels import discontinuity_mask
-from rtgs.render.discontinuities.trace import fragile_rays
+from rtgs.render.buffers import RasterBuffers
+from rtgs.render.discontinuities.surfels import DiscontinuityBands, discontinuity_mask
+from rtgs.render.discontinuities.trace import TraceBands, fragile_rays
 from rtgs.render.reference import surfels as reference
 from rtgs.render.reference import trace as reference_trace
+from rtgs.scenes.scene import View
+from rtgs.train.method import RenderedView
+from rtgs.train.settings import LossSettings
 
 STEP = 40  # SH of degree 2 in both sets
+Bands = tuple[DiscontinuityBands, TraceBands]
+WIDE: Bands = (DiscontinuityBands(), TraceBands())
 
 
 @dataclass(frozen=True)
 class TwinRender:
     image: Tensor  # (3, H, W) float64
+    buffers: RasterBuffers  # of the base set
     fragile: Tensor  # (H, W) bool: a decision lies within float32 rounding of its threshold
 
 
-def twin_render(method: Model, base, reflection, camera, images, texels=None) -> TwinRender:
+def twin_render(method: Model, base, reflection, camera, images, texels=None, bands: Bands = WIDE) -> TwinRender:
     """What ``method.render`` computes, from float64 copies of both sets, by the readable twins alone."""
     settings = method.settings
     surfels = activate(base, camera.center, method.base.sh_degree(STEP))
@@ -88,10 +98,12 @@ def twin_render(method: Model, base, reflection, camera, images, texels=None) ->
     change = flat.specular * light if settings.optics.weight == "additive" else specular_change(flat, light, None)
     change = torch.where(covered, change, 0.0)
     image = (flat.diffuse + change).reshape(3, camera.height, camera.width)
-    fragile = discontinuity_mask(*shape, features, camera, options=options).flatten()
-    fragile |= fragile_rays(*traced_shape, mirrored.origins, mirrored.directions, **colors, options=trace)
+    fragile = discontinuity_mask(*shape, features, camera, options=options, bands=bands[0]).flatten()
+    fragile |= fragile_rays(
+        *traced_shape, mirrored.origins, mirrored.directions, **colors, options=trace, bands=bands[1]
+    )
     fragile |= (length < 0.05) | ((buffers.alpha.flatten() - settings.reflection.smallest_alpha).abs() < 1e-4)
-    return TwinRender(image, fragile.reshape(camera.height, camera.width))
+    return TwinRender(image, buffers, fragile.reshape(camera.height, camera.width))
 
 
 def doubled(surfels):
@@ -158,3 +170,50 @@ def test_image_and_every_gradient_are_those_of_the_twins(case: str):
         assert found is not None
         assert float((found.double() - exact.grad).norm() / exact.grad.norm()) < 2e-3
     assert len(texels) == (case == "cubemap")
+
+
+# ---- with the losses of the stage
+
+SURFACE = LossSettings(
+    normal=0.02, normal_start=0.0, normal_inverse_depth=True, mono_normal=0.02, distortion=0.5, distortion_start=0.0
+)
+MATERIALS = ("specular_logits", "roughness_logits", "f0_logits")
+TRAINED: dict[str, dict[str, Any]] = {
+    "envgs": {"loss": SURFACE, "density": MCMC},
+    "rtgs": {"loss": replace(SURFACE, clipped=True, normal_inverse_depth=False)},
+}
+
+
+class TracedTwin(Twin):
+    """The second stage of EnvGS and RT-GS: what the mirror rays met is added."""
+
+    def render(self, camera: Camera) -> tuple[RenderedView, Tensor]:
+        bands = (BANDS, TraceBands())
+        found = twin_render(self.method, self.sets["base"], self.sets["reflection"], camera, [], bands=bands)
+        maps = {"specular": found.buffers.features[3]}
+        return RenderedView(camera, found.image, found.buffers, maps=maps), found.fragile
+
+    def own_losses(self, shown: RenderedView, view: View) -> Terms:
+        return {}
+
+
+@pytest.mark.parametrize("name", TRAINED)
+def test_losses_and_their_gradients_are_those_of_the_twins(name: str):
+    made = scene()
+    materials = MaterialSettings(specular=0.4, roughness=0.1)
+    quiet = recipe(name, propagation=PropagationSettings(every=0))
+    method = begun(replace(quiet, materials=materials, **TRAINED[name]), made)
+    generator = torch.Generator().manual_seed(4)
+    with torch.no_grad():
+        base, reflection = (method[each].gaussians for each in ("base", "reflection"))
+        reflection.sh_rest += 0.1 * torch.randn(reflection.sh_rest.shape, generator=generator)
+        reflection.opacity_logits += 1.5
+        base.sh_dc += 5.0  # brighter than a photo shows
+        for values in (base[raw] for raw in MATERIALS):
+            values += 0.5 * torch.randn(values.shape, generator=generator)
+    found = compare(TracedTwin(method), made)
+    assert {"l1", "dssim", "normal", "mono_normal", "distortion"} <= found.terms.keys()
+    both = {f"reflection.{raw}" for raw in ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest")}
+    assert both <= found.learned
+    unread = set(MATERIALS[1:]) if name == "envgs" else set()
+    assert {raw for raw, _ in method["base"].tensors()} - unread <= found.learned

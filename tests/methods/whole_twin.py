@@ -85,7 +85,8 @@ class Twin:
     def __init__(self, method: Model) -> None:
         self.method = method
         self.own: dict[str, Any] = dict(method.settings.own)
-        self.gaussians = doubled(method["base"].gaussians)
+        self.sets = {each.name: doubled(each.gaussians) for each in method.sets}
+        self.gaussians = self.sets["base"]
         self.groups = {
             group.name: {name: tensor.detach().double().requires_grad_() for name, tensor in group.tensors()}
             for group in method.groups
@@ -121,8 +122,9 @@ class Twin:
             drawn = rasterize_ellipsoids(*shape, columns, camera, background=behind, options=options)
             found = RasterBuffers(drawn.features[:-3], drawn.alpha, drawn.depth, normal=drawn.features[-3:])
             fragile = ellipsoid_discontinuity_mask(*shape, columns, camera, options=options, bands=BANDS)
-        assert found.normal is not None
-        return found, fragile | (found.normal.detach().norm(dim=0) < SHORT * found.alpha.detach())
+        if found.normal is not None:  # what is shaded row by row has none, unless a loss asks for it
+            fragile |= found.normal.detach().norm(dim=0) < SHORT * found.alpha.detach()
+        return found, fragile
 
     def losses(self, shown: RenderedView, view: View) -> Terms:
         """Every term, as far as the weights ask for it."""
@@ -236,7 +238,10 @@ def compare(twin: Twin, made: MirrorScene) -> Compared:
 
 def same_gradients(twin: Twin) -> set[str]:
     """Fail unless every parameter has the twin's gradient; the names of those that have one."""
-    pairs = {name: (tensor, twin.gaussians[name]) for name, tensor in twin.method["base"].gaussians.items()}
+    pairs = {}
+    for each in twin.method.sets:
+        place = "" if each.name == "base" else f"{each.name}."
+        pairs |= {f"{place}{name}": (raw, twin.sets[each.name][name]) for name, raw in each.gaussians.items()}
     for group in twin.method.groups:
         pairs |= {f"{group.name}.{name}": (tensor, twin.groups[group.name][name]) for name, tensor in group.tensors()}
     learned = set()
