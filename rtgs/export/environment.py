@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,9 +13,9 @@ from rtgs.methods.parts.mirror import Mirror
 
 if TYPE_CHECKING:
     from rtgs.methods.model import Model
+    from rtgs.methods.parts.traced_light import TracedLight
 
 _BRIGHTEST = 0.999  # quantile of the colours that a picture of 8 bits still tells apart
-_RAYS = 65_536
 
 
 @dataclass(frozen=True)
@@ -53,28 +53,21 @@ def bake_environment(
     """
     directions = panorama_directions(height, frame)
     mirror = model.parts.get(Mirror.name)
-    if isinstance(mirror, Mirror) and mirror.set is not None:
-        return _traced(mirror, step, place, near, directions)
+    traced = mirror.light_from(torch.from_numpy(place).float(), step, near) if isinstance(mirror, Mirror) else None
+    if traced is not None:
+        return _traced(traced, directions)
     if model.light is not None:
         return Environment(light_picture(model.light, directions), 0.0)
     return None
 
 
-def _traced(mirror: Mirror, step: int, place: np.ndarray, near: float, directions: np.ndarray) -> Environment:
-    assert mirror.set is not None
-    options = replace(mirror.trace_options(step, False), t_min=near, depth=True)
-    rays = torch.from_numpy(directions.reshape(-1, 3)).float()
-    origins = torch.from_numpy(np.asarray(place)).float().expand_as(rays)
-    colors, depths = [], []
-    for chosen in torch.arange(len(rays)).split(_RAYS):
-        found, _ = mirror.set.trace(origins[chosen].contiguous(), rays[chosen].contiguous(), options, watched=False)
-        assert found.colors is not None
-        assert found.depth is not None
-        colors.append(mirror.over_sky(found.colors, found.alpha, rays[chosen]))
-        seen = found.alpha > 0.5
-        depths.append(found.depth[seen] / found.alpha[seen])
-    far = torch.cat(depths)
-    panorama = torch.cat(colors).reshape(directions.shape).numpy()
+def _traced(light: TracedLight, directions: np.ndarray) -> Environment:
+    """As :func:`rtgs.light.pictures.light_picture` of it, and how far away what is seen is."""
+    found = light.seen(torch.from_numpy(directions.reshape(-1, 3)).float())
+    assert found.depth is not None
+    seen = found.alpha > 0.5
+    far = found.depth[seen] / found.alpha[seen]
+    panorama = found.color.reshape(directions.shape).numpy()
     return Environment(panorama, float(far.median()) if len(far) else 0.0)
 
 

@@ -16,7 +16,11 @@ from rtgs.light.settings import CubemapSettings
 
 
 class DirectionalLight(Protocol):
-    """Light from far away: it depends on the direction alone, and on how wide the lobe is that gathers it."""
+    """Light from far away: it depends on the direction alone, and on how wide the lobe is that gathers it.
+
+    A cubemap (here), a map of features with a network, and a traced set as it is seen from one place
+    (``rtgs/methods/parts``: ``feature_light``, ``traced_light``). The last has no lobes: roughness is ignored.
+    """
 
     def __call__(self, directions: Tensor, roughness: Tensor | None = None) -> Tensor:
         """(P, 3) colours along ``directions`` (P, 3) world, of any length, for ``roughness`` (P,) in 0..1; None: 0."""

@@ -26,6 +26,7 @@ from rtgs.methods.parts.matte import MatteEvidence, gather_evidence
 from rtgs.methods.parts.part import Frame, Look, Part, Raster
 from rtgs.methods.parts.propagation import propagate_normals, reset_specular
 from rtgs.methods.parts.reflection_init import copied_surfels, reflection_surfels, scene_color
+from rtgs.methods.parts.traced_light import TracedLight
 from rtgs.methods.parts.traced_set import TracedSet
 from rtgs.methods.plans import (
     base_densify_due,
@@ -257,6 +258,13 @@ class Mirror(Part):
         of what they met."""
         sky = self._sky if (light := self.light) is None else light(directions)
         return colors if sky is None else colors + (1 - alpha)[:, None] * sky
+
+    def light_from(self, origin: Tensor, step: int, near: float) -> TracedLight | None:
+        """What rays from ``origin`` (3,) world meet at ``step``, ``near`` world units away or farther; None: no set."""
+        if self.set is None:
+            return None
+        options = replace(self.trace_options(step, False), t_min=near, depth=True)
+        return TracedLight(self.set, origin, options, self.over_sky)
 
     def lights(self, met: Reflected, weight: Tensor, bare: Tensor | None = None) -> tuple[Light, ...]:
         """What the surface mirrors, with its ``weight``, and what it shows under a coat.
