@@ -9,7 +9,8 @@ import pytest
 from rtgs.config import compose
 from rtgs.train.schedule import check_schedule, densify_due, loss_start, opacity_reset_due, sh_degree_at
 
-METHODS = ("2dgs", "3dgs", "envgs", "rtgs")
+METHODS = ("2dgs", "3dgs", "3dgs_dr", "gaussian_shader", "ref_gaussian", "ref_gs", "envgs", "rtgs")
+NORMAL_FROM = {"2dgs": 7000, "ref_gaussian": 0, "ref_gs": 700, "envgs": 0, "rtgs": 0}  # others have no such loss
 
 
 @pytest.mark.parametrize("preset", ["smoke", "quick", "standard"])
@@ -38,5 +39,7 @@ def test_the_paper_preset_is_the_methods_own_schedule_and_numbers(method: str):
     assert config.scene.long_side is None
     assert config.method.density.max_surfels == 2_000_000
     assert config.method.optimizer.means_initial == 1.6e-4
-    start = loss_start(config.method.loss.normal_start, config.schedule.total)
-    assert start == {"2dgs": 7000, "3dgs": 7000, "envgs": 0, "rtgs": 0}[method]
+    loss = config.method.loss
+    assert (loss.normal > 0) == (method in NORMAL_FROM)
+    if loss.normal > 0:
+        assert loss_start(loss.normal_start, config.schedule.total) == NORMAL_FROM[method]

@@ -24,6 +24,7 @@ from tests.mesh.shapes import sphere
 
 NO_RATES = ("beta1", "beta2", "eps", "opacity_logit_limit", "smallest_scale", "largest_scale", "decay_from", "decay_to")
 STEPS = 2000
+FEWER = 500  # of what differs in one part alone
 
 
 def violent(factor: float, base: OptimizerSettings | None = None) -> OptimizerSettings:
@@ -43,11 +44,18 @@ def noise(*, masked: bool) -> Scene:
     return replace(scene, train=tuple(replace(view, mask=disc) for view in scene.train))
 
 
-def method_of(name: str) -> MethodSettings:
-    """Its stages begin at 5 % and a third of the run, and none is left out."""
+def method_of(name: str, variant: str = "") -> MethodSettings:
+    """Its stages begin at 5 % and a third of the run, and none is left out.
+
+    ``variant``: "surfels" of 3dgs_dr, or "cubemap" behind the traced set of envgs.
+    """
     settings = replace(small_method(name), optimizer=violent(30))
     if name in ("2dgs", "3dgs"):
         return settings
+    if name == "3dgs_dr":
+        fast = EnvironmentSettings(side=32, rate=30 * EnvironmentSettings().rate)
+        own = {"primitive": variant or "ellipsoids", "scope_radius": 0.8}
+        settings = replace(settings, environment=fast, own=own)
     if name == "ref_gaussian":  # three levels, a mesh every tenth of the run
         cubemap = EnvironmentSettings(side=32, mips="ggx", levels=(32, 16, 16), rate=0.3)
         settings = replace(settings, environment=cubemap, own={"mesh_cells": 64, "smooth": 0.45})
@@ -55,6 +63,11 @@ def method_of(name: str) -> MethodSettings:
         fast = replace(settings.environment, rate=0.06)
         settings = replace(settings, environment=fast, own={"network_rate": 0.015, "scope_radius": 0.8})
     reflection = replace(settings.reflection, matte=MatteSettings(probation=0.0), cells=6)
+    if name == "3dgs_dr":
+        reflection = replace(reflection, propagation=replace(reflection.propagation, every=200))
+    if variant == "cubemap":
+        reflection = replace(reflection, background="cubemap")
+        settings = replace(settings, environment=EnvironmentSettings(side=32, rate=30 * EnvironmentSettings().rate))
     if name == "gaussian_shader":
         fast = replace(settings.environment, rate=0.5)
         return replace(settings, environment=fast, own={"shared_rate": True})
@@ -89,15 +102,16 @@ def test_every_rate_is_one_of_those_that_are_raised():
 
 
 SMALL = ("2dgs", "3dgs", "3dgs_dr", "gaussian_shader", "ref_gaussian", "ref_gs", "envgs", "rtgs", "rtgs_printed")
+VARIANTS = ("3dgs_dr, surfels", "envgs, cubemap")
 SHIPPED = ("rtgs, as shipped", "rtgs_printed, as shipped")
 
 
-@pytest.mark.parametrize("name", [*SMALL, *SHIPPED])
-def test_2000_steps_at_30_times_the_learning_rates_on_noise_stay_finite(name: str):
+@pytest.mark.parametrize("name", [*SMALL, *VARIANTS, *SHIPPED])
+def test_500_or_2000_steps_at_30_times_the_learning_rates_on_noise_stay_finite(name: str):
     """All stages of a method: glass with an interface and a bounded weight in rtgs, without either as printed."""
-    name, _, files = name.partition(", ")
-    three_stages = name.startswith("rtgs")
-    settings, scene = shipped(name) if files else method_of(name), noise(masked=three_stages)
+    name, _, variant = name.partition(", ")
+    three_stages, files = name.startswith("rtgs"), variant == "as shipped"
+    settings, scene = shipped(name) if files else method_of(name, variant), noise(masked=three_stages)
     if files:
         light = settings.transmittance.wall.light
         assert light == {"rtgs": "fresnel", "rtgs_printed": "learned"}[name]
@@ -105,23 +119,30 @@ def test_2000_steps_at_30_times_the_learning_rates_on_noise_stay_finite(name: st
         bare = replace(settings.transmittance, split=False, max_gain=None)
         bare = replace(bare, interface=replace(bare.interface, count=0), first_surface="base")
         settings = replace(settings, transmittance=bare)
-    plan = small_schedule(STEPS, densify_from=100, densify_until=1500, densify_every=100, opacity_reset_every=500)
+    steps = FEWER if variant and not files else STEPS
+    density = dict(densify_from=100, densify_until=3 * steps // 4, densify_every=100)
+    plan = small_schedule(steps, **density, opacity_reset_every=steps // 4)
     mesh = ObjectMesh(sphere(1.0, 16), "given", voxel=0.05, flat=False) if three_stages else None
     method = create_method(settings, scene, plan, generator_for(3, "initialise"), mesh)
     assert isinstance(method, Model)
     for stage in method.stages:
         trainer = Trainer(method, scene, seed=3, stage=stage)
         trainer.run()  # the guard stops at any non-finite loss or gradient
-    assert method.stages[-1].until == STEPS
+    assert method.stages[-1].until == steps
     assert [stage.name for stage in method.stages][1:] == ["reflection", "transmittance"][: len(method.stages) - 1]
     counts = {"2dgs": 1, "3dgs": 1, "3dgs_dr": 2, "gaussian_shader": 1, "ref_gaussian": 2, "ref_gs": 2, "envgs": 2}
     assert len(method.stages) == counts.get(name, 3)
     assert (method.find("transmittance") is not None) == three_stages
     for part in method.sets:
         _within_limits(part.gaussians, settings.optimizer, scene.extent, part.name)
+    for group in method.groups:
+        assert all(bool(torch.isfinite(tensor).all()) for _, tensor in group.tensors()), group.name
+    if name == "3dgs_dr" or variant == "cubemap":
+        (texels,) = (group["texels"] for group in method.groups if group.name == "environment")
+        assert float(texels.detach().abs().max()) > 4 * EnvironmentSettings().noise, "the cubemap's rate is raised"
     for view in (*scene.train, *scene.test):
         with torch.no_grad():
-            assert bool(torch.isfinite(method.render(view.camera, STEPS, Mode.TRAIN).image).all())
+            assert bool(torch.isfinite(method.render(view.camera, steps, Mode.TRAIN).image).all())
 
 
 def _within_limits(gaussians, limits: OptimizerSettings, extent: float, name: str) -> None:
