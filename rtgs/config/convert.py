@@ -36,8 +36,8 @@ def to_run_config(composed: DictConfig, choices: Choices) -> tuple[RunConfig, Ch
     """The composed config as dataclasses: interpolations resolved, paths absolute, names derived.
 
     Raises:
-        RtgsError: a mandatory value is missing or an interpolation fails (names the key); the ablation changes nothing
-            of this run.
+        RtgsError: a mandatory value is missing or an interpolation fails (names the key); the preset has nothing of the
+            method; the ablation changes nothing of this run.
     """
     hide_credentials(composed)
     try:
@@ -46,6 +46,7 @@ def to_run_config(composed: DictConfig, choices: Choices) -> tuple[RunConfig, Ch
         raise RtgsError(f"config: {unresolved(error, error.full_key or 'a value')}") from error
     assert isinstance(values, dict)
     config = build(RunConfig, {str(key): value for key, value in values.items()})
+    _refuse_preset_of_others(config, choices)
     _refuse_idle_ablation(config, choices)
     config = _of_external(config)
     config = replace(config, method=with_own(config.method))
@@ -95,6 +96,26 @@ def with_own(method: MethodSettings) -> MethodSettings:
     return replace(method, own={k: v for k, v in asdict(made).items() if v != getattr(type(made)(), k)})
 
 
+def _refuse_preset_of_others(config: RunConfig, choices: Choices) -> None:
+    """``preset=paper_<kind>`` is what authors publish for scenes of a kind: a method without a file for it has none.
+
+    Raises:
+        RtgsError: the method has none.
+    """
+    preset, method = choices.preset, config.method.name
+    if _has_preset(method, preset):
+        return
+    fit = [spec.name for spec in own_methods() if _has_preset(spec.name, preset)]
+    raise RtgsError(
+        f"config: preset={preset} has nothing of method {method}: it is for {', '.join(fit)}; preset=paper is its "
+        "published schedule"
+    )
+
+
+def _has_preset(method: str, preset: str) -> bool:
+    return not preset.startswith("paper_") or f"{preset}_{method}" in choices_of("method_in_preset")
+
+
 def _refuse_idle_ablation(config: RunConfig, choices: Choices) -> None:
     """An ablation is for methods that have what it takes away, with presets that have it on.
 
@@ -123,7 +144,8 @@ def _refuse_off(config: RunConfig, choices: Choices) -> None:
     idle_with = config.ablation.idle_with
     said = f"config: ablation={choices.ablation} takes nothing away from method {config.method.name} with"
     if choices.preset in idle_with:
-        fit = ", ".join(name for name in choices_of("preset") if name not in idle_with)
+        presets = (name for name in choices_of("preset") if _has_preset(config.method.name, name))
+        fit = ", ".join(name for name in presets if name not in idle_with)
         raise RtgsError(f"{said} preset={choices.preset}, where it is off already: it is for preset {fit}")
     for key, _, text in (each.partition("=") for each in idle_with if "=" in each):
         try:

@@ -90,6 +90,12 @@ def fitting(method: str, preset: str = "") -> list[str]:
     return found
 
 
+def presets_of(method: str) -> list[str]:
+    """Every preset but those of scenes of a kind for which the method has no schedule."""
+    own = choices_of("method_in_preset")
+    return [name for name in choices_of("preset") if not name.startswith("paper_") or f"{name}_{method}" in own]
+
+
 def flat_leaves(values: dict, *before: str) -> Iterator[tuple[str, object]]:
     """Dotted keys and values of a file of ``conf/``, without what it says about itself."""
     for key, value in values.items():
@@ -111,6 +117,7 @@ def recipes(method: str) -> Iterator[tuple[str, list[str]]]:
     with patch("rtgs.pretrained.weights.weight_folders", tuple):  # a machine without networks
         idle = [name for name in fitting(method) if name not in fitting(method, "paper")]
         chosen = [("paper", fitting(method, "paper")), ("smoke,quick,standard", ["none"])]
+        chosen += [(preset, ["none"]) for preset in presets_of(method) if preset.startswith("paper_")]
         for presets, ablations in [*chosen, ("quick", idle)] if idle else chosen:
             files = [f"method={method}", f"preset={presets}", f"ablation={','.join(ablations)}"]
             for job in _jobs(["scene=ball_statue", *files, f"scene.path={paths}"]):

@@ -8,9 +8,10 @@ from functools import cache
 import pytest
 import torch
 import yaml
+from recipes import presets_of
 
 from rtgs.config import compose
-from rtgs.config.locate import choices_of, conf_dir
+from rtgs.config.locate import conf_dir
 from rtgs.config.schema import RunConfig
 from rtgs.core.recipe import flatten
 from rtgs.methods import find_method
@@ -67,7 +68,7 @@ def composed(*words: str) -> tuple[RunConfig, dict[str, object]]:
     return config, flatten(asdict(config))
 
 
-@pytest.mark.parametrize("preset", choices_of("preset"))
+@pytest.mark.parametrize("preset", presets_of("rtgs_printed"))
 def test_no_preset_changes_what_is_printed(preset: str):
     _, found = composed("method=rtgs_printed", f"preset={preset}")
     assert {key: found[key] for key in EQUATIONS} == EQUATIONS

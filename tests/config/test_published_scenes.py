@@ -12,7 +12,7 @@ from functools import cache
 
 import pytest
 import yaml
-from recipes import STAND_INS, TRAINED, flat_leaves, scenes_of
+from recipes import STAND_INS, TRAINED, flat_leaves, presets_of, scenes_of
 
 from pipelines.publishing.against_paper import keys_of
 from rtgs.config import RunConfig, compose
@@ -103,7 +103,7 @@ def test_there_is_a_file_for_what_is_tested_here_and_for_nothing_else():
 
 @pytest.mark.parametrize("method", sorted({method for method, _ in FILES}))
 def test_short_presets_and_other_scenes_have_one_recipe(method: str):
-    for preset in choices_of("preset"):
+    for preset in presets_of(method):
         plain = composed(method, "matte_room", preset)
         for scene in ("fox", "nu_nerf/ballstatue") if preset == "paper" else scenes_of(method):
             config = composed(method, scene, preset)

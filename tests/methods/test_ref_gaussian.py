@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 import torch
-from ref_gaussian_cases import CUBEMAP, INDIRECT, MATERIALS, STEP, mirror, settings, trained
-from reflective_cases import new_method, schedule, tiny, train_step, training_maps
+from ref_gaussian_cases import CUBEMAP, INDIRECT, MATERIALS, mirror, settings, trained
+from reflective_cases import new_method, schedule, tiny, train_step
 from torch import Tensor
 from training_cases import small_scene
 
 from rtgs.config import compose
+from rtgs.core.errors import RtgsError
 from rtgs.gaussians.density import logit
 from rtgs.gaussians.harmonics import SH_C0, sh_basis
-from rtgs.gaussians.surfels import activate
 from rtgs.light.cubemap import CubemapLight
 from rtgs.light.faces import texel_directions
 from rtgs.mesh.guide import MeshGuide
@@ -23,7 +23,6 @@ from rtgs.mesh.triangles import TriangleMesh
 from rtgs.methods import Mode, RenderOptions, Stage, create_method, find_method
 from rtgs.methods.model import Model
 from rtgs.methods.parts import visibility
-from rtgs.methods.parts.kinds import surfel_options
 from rtgs.methods.parts.split_sum_mirror import (
     INDIRECT_DC,
     INDIRECT_REST,
@@ -34,11 +33,11 @@ from rtgs.methods.parts.split_sum_mirror import (
 from rtgs.methods.ref_gaussian import RefGaussianSettings
 from rtgs.methods.shading.split_sum import mean_normal, mirrored
 from rtgs.optics.split_sum import lobe_factors, split_sum_factors
-from rtgs.render.discontinuities.surfels import discontinuity_mask
-from rtgs.render.reference import surfels as reference
 from rtgs.report.shown import layers_of
 from rtgs.train.seeds import generator_for
 from tests.mesh.shapes import sphere
+
+SHARES = ("forward_until", "smooth_until", "indirect_from", "mesh_every")
 
 
 def test_the_published_numbers():
@@ -66,86 +65,34 @@ def test_the_published_numbers():
     assert (own.reach, own.mesh_cells, own.mesh_pieces, own.weight_floor) == (10.0, 512, 1, 0.01)
 
 
+def test_the_published_numbers_for_synthetic_scenes():
+    """Those of real scenes but for these."""
+    real, _ = compose(["scene=demo", "method=ref_gaussian", "preset=paper"])
+    config, _ = compose(["scene=demo", "method=ref_gaussian", "preset=paper_synthetic"])
+    method, total = config.method, config.schedule.total
+    assert config.schedule == replace(real.schedule, total=50_000)
+    reflection = method.reflection
+    assert round(reflection.start * total) == 1
+    assert round(reflection.propagation.until * total) == 25_000
+    assert reflection.propagation == replace(real.method.reflection.propagation, until=0.5, sabotage=0.4)
+    own = find_method("ref_gaussian").own_settings(method)
+    shares = (own.forward_until, own.smooth_until, own.indirect_from, own.mesh_every)
+    assert [round(share * total) for share in shares] == [18_000, 18_000, 20_000, 2_000]
+    assert own == replace(RefGaussianSettings(), **dict(zip(SHARES, shares, strict=True)))
+    assert (config.scene.background, method.render.background) == ((1.0, 1.0, 1.0), (1.0, 1.0, 1.0))
+    keys = {"own", "paper_schedule", "reflection", "render"}
+    assert {f.name for f in fields(method) if getattr(method, f.name) != getattr(real.method, f.name)} == keys
+    assert replace(reflection, start=0.15, propagation=real.method.reflection.propagation) == real.method.reflection
+
+
+@pytest.mark.parametrize("method", ["3dgs_dr", "rtgs", "external"])
+def test_methods_without_a_schedule_for_synthetic_scenes_refuse_it(method: str):
+    message = f"preset=paper_synthetic has nothing of method {method}: it is for ref_gaussian; preset=paper"
+    with pytest.raises(RtgsError, match=message):
+        compose(["scene=demo", f"method={method}", "preset=paper_synthetic"])
+
+
 # ---- equations
-
-
-def twin_shade(method: Model, base, texels: Tensor, camera, free: Tensor) -> tuple[Tensor, Tensor]:
-    """The image (3, H, W) from float64 copies by the readable twins and the formulas written out; which pixels' hits
-    are decided by rounding (H, W)."""
-    part = mirror(method)
-    surfels = activate(base, camera.center, method.base.sh_degree(STEP))
-    normals = torch.linalg.cross(surfels.tangent_u, surfels.tangent_v, dim=1)
-    to_eye = torch.nn.functional.normalize(camera.center - surfels.means, dim=1)
-    own_mirror = 2 * (normals * to_eye).sum(1, keepdim=True) * normals - to_eye
-    functions = torch.cat((torch.full((len(base), 1), SH_C0, dtype=torch.float64), sh_basis(own_mirror, 3)), 1)
-    coefficients = torch.cat((base[INDIRECT_DC][:, None], base[INDIRECT_REST].reshape(-1, 15, 3)), 1)
-    light = torch.einsum("nk,nkc->nc", functions, coefficients).relu()
-    materials = [base[name].sigmoid().reshape(len(base), -1) for name in MATERIALS]
-    features = torch.cat((surfels.colors, *materials, light), 1)
-    shape = (surfels.means, surfels.tangent_u, surfels.tangent_v, surfels.scales, surfels.opacities)
-    options = surfel_options(
-        training_maps(method, camera, STEP), method.settings.render, method.extent, weight_sum=False
-    )
-    maps = reference.rasterize_surfels(*shape, features, camera, options=options)
-    assert maps.normal is not None
-    normal = maps.normal / maps.alpha.clamp_min(1e-6)
-    view = camera.rays(torch.float64).directions.permute(2, 0, 1)
-    view = view / view.norm(dim=0)
-    cosine = -(normal * view).sum(0)
-    direction = view + 2 * cosine * normal
-    color, metal, rough, albedo, indirect = maps.features.split((3, 1, 1, 3, 3))
-    cube = CubemapLight(texels, part.settings.environment)
-    direct = cube(direction.flatten(1).T, rough.flatten()).T.reshape(color.shape)
-    scale, bias = split_sum_factors(cosine, rough[0].clamp(1e-3, 1) ** 2)
-    reflectance = 0.04 * (1 - metal) + albedo * metal
-    light = free * direct + (1 - free) * indirect
-    image = (1 - metal) * color + maps.alpha * (reflectance * scale + bias) * light
-    return image, discontinuity_mask(*shape, features, camera, options=options)
-
-
-def test_image_and_every_gradient_are_those_of_the_twins():
-    """All of it: rasterised materials, the prefiltered cubemap, the table, indirect light behind a sphere."""
-    made = tiny()
-    method = new_method(settings(), made, schedule())
-    method.begin(Stage("reflection", 15, 60))
-    part, generator = mirror(method), torch.Generator().manual_seed(4)
-    part._begin_indirect()
-    ball = sphere(0.7, 12)
-    part.visibility._have(TriangleMesh(ball.vertices + np.float32([1.2, -0.8, 0.3]), ball.faces), 0.1)
-    gaussians = method["base"].gaussians
-    with torch.no_grad():
-        gaussians.sh_rest += 0.1 * torch.randn(gaussians.sh_rest.shape, generator=generator)
-        gaussians.opacity_logits += 1.5
-        gaussians.log_scales += 0.3
-        for name in MATERIALS:
-            gaussians[name] += 0.5 * torch.randn(gaussians[name].shape, generator=generator)
-        for name in INDIRECT:
-            gaussians[name] += 0.3 + 0.3 * torch.randn(gaussians[name].shape, generator=generator)
-    camera = made.scene.train[0].camera
-    doubled = {name: tensor.detach().double().requires_grad_() for name, tensor in gaussians.items()}
-    base, (group,) = gaussians.like(doubled), method.groups
-    texels = group["texels"].detach().double().requires_grad_()
-    with torch.no_grad():
-        layers = method.render(camera, STEP, Mode.EVALUATE, RenderOptions(layers=True)).layers
-    assert layers is not None
-    free = layers["visible"].double()
-    assert 0.01 < float((1 - free).mean()) < 0.9, "some mirror directions are free"
-    expected, fragile = twin_shade(method, base, texels, camera, free)
-    rendered = method.render(camera, STEP, Mode.TRAIN)
-    clear = ~fragile
-    assert float(clear.double().mean()) > 0.3
-    assert float((rendered.image.detach().double() - expected.detach()).abs().amax(0)[clear].max()) < 2e-4
-    upstream = torch.randn(expected.shape, generator=generator, dtype=torch.float64) * clear
-    (expected * upstream).sum().backward()
-    (rendered.image * upstream.float()).sum().backward()
-    pairs = {name: (tensor.grad, base[name].grad) for name, tensor in gaussians.items()}
-    pairs["texels"] = (group["texels"].grad, texels.grad)
-    for name, (found, exact) in pairs.items():
-        assert found is not None, name
-        assert exact is not None, name
-        assert float(exact.abs().max()) > 0, name
-        difference = float((found.double() - exact).norm() / exact.norm())
-        assert difference < 2e-3, f"{name}: {difference:.2g}"
 
 
 def test_directions_by_finite_differences():
