@@ -35,6 +35,10 @@ def run(root, capture) -> Path:
     return root / "runs" / "mirror"
 
 
+def test_the_report_says_what_the_layers_are_in_the_symbols_of_the_method(run):
+    assert "what mirrored light adds: k_s w_r C_r" in (run / "report.html").read_text(encoding="utf-8")
+
+
 def test_the_run_ends_with_a_preview_that_the_report_shows(run):
     with Image.open(run / "preview.webp") as opened:
         assert opened.n_frames == 24  # type: ignore[attr-defined]
