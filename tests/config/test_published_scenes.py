@@ -139,8 +139,8 @@ def test_a_word_wins_and_where_a_value_comes_from_is_told():
     assert config.method.reflection.start == 0.25
     assert composed("envgs", "sedan", "paper", "schedule.total=77").schedule.total == 77
     chosen = ["scene=ref_real/gardenspheres", "method=envgs", "preset=paper"]
-    file = "conf/method_on_scene/paper/envgs/spheres.yaml"
-    assert [each.place for each in settings_of("method.materials.specular", chosen)] == [file]
+    files = ["conf/method/envgs.yaml", "conf/method_on_scene/paper/envgs/spheres.yaml"]
+    assert [each.place for each in settings_of("method.materials.specular", chosen)] == files
     after = settings_of("method.reflection.start", ["scene=toycar", "method=ref_gs", "preset=paper"])
     assert [each.place.rpartition("conf/")[2] for each in after[-2:]] == [
         "after_preset/ref_gs.yaml",
