@@ -62,7 +62,7 @@ def test_both_stages_run_and_leave_two_sets_and_layers(root: Path, capture: Path
     assert summary["steps"] == 12
     run = root / "runs" / f"tiny_room-{name}-smoke-{overridden([*QUICK, *SECOND])}"
     page = (run / "report.html").read_text()
-    layers = ("Diffuse", "Reflection", "Normal", "Specular k_s", "Roughness", "f0", "Final")
+    layers = ("Diffuse", "Reflection", "Normal", "Specular", "Roughness", "f0", "Final")
     assert all(f"Enlarge {layer}, rendered" in page for layer in layers)
     assert {path.name for path in run.glob("*.ply")} == {"point_cloud.ply", "reflection.ply"}
     assert main(words) == 0
