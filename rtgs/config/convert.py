@@ -113,11 +113,9 @@ def _refuse_preset_of_others(config: RunConfig, choices: Choices) -> None:
 
 
 def _has_preset(method: str, preset: str) -> bool:
-    if not preset.startswith("paper_") or preset not in choices_of(
-        "preset"
-    ):  # those of a folder of one's own: not known
-        return True
-    return f"{preset}_{method}" in choices_of("method_in_preset")
+    """Those of a folder of one's own are not known, and hold for all."""
+    shipped = preset.startswith("paper_") and preset in choices_of("preset")
+    return not shipped or f"{preset}_{method}" in choices_of("method_in_preset")
 
 
 def _refuse_idle_ablation(config: RunConfig, choices: Choices) -> None:
