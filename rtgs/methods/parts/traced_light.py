@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -55,7 +54,9 @@ class TracedLight:
 
     def irradiance(self, normals: Tensor) -> Tensor:
         """(P, 3) of the light in a cubemap of few directions, the same number as other lights have for it."""
-        return self._few.irradiance(normals)
+        side = DIFFUSE_SIDE
+        texels = self(torch.tensor(texel_directions(side), dtype=torch.float32)).reshape(FACES, side, side, 3)
+        return CubemapLight(texels, CubemapSettings(side=side, activation="identity")).irradiance(normals)
 
     def seen(self, directions: Tensor) -> SeenLight:
         """What rays along ``directions`` (P, 3) world, of any length, meet."""
@@ -70,9 +71,3 @@ class TracedLight:
         behind = self.behind
         color = found.colors if behind is None else behind(found.colors, found.alpha, directions)
         return SeenLight(color, found.alpha, found.depth)
-
-    @cached_property
-    def _few(self) -> CubemapLight:
-        side = DIFFUSE_SIDE
-        texels = self(torch.tensor(texel_directions(side), dtype=torch.float32)).reshape(FACES, side, side, 3)
-        return CubemapLight(texels, CubemapSettings(side=side, activation="identity"))
