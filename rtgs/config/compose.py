@@ -104,7 +104,8 @@ def _resolved(overrides: Sequence[str]) -> list[str]:
         try:
             found.append(str(overrides[index]))
         except OmegaConfBaseException as error:
-            word = str(overrides._get_node(index)) if isinstance(overrides, ListConfig) else ""
+            assert isinstance(overrides, ListConfig)  # words in a plain list are not resolved
+            word = str(overrides._get_node(index))
             taken = " and ".join(re.findall(r"\$\{[\w.]+\}", word))  # not all of the value: it may hold a password
             if not taken:
                 raise RtgsError(f"config: {unresolved(error, _key(word))}") from error

@@ -63,12 +63,10 @@ def build(setup: Setup) -> Model:
     terms = (*surface_terms(setup), *mcmc_terms(base, setup))
     if not own.scoped:
         return Model(setup, (base, CubemapMirror(setup, base, own.weight_floor)), terms)
-    if own.outside == 0:
-        idle = Decision("no scope, all may reflect", "method.own.outside=0: there is no loss outside of it")
-        return Model(setup, (base, CubemapMirror(setup, base, own.weight_floor)), (*terms, idle))
     held = ScopeHolder(setup, base, own, WEIGHT, weight_of)
     mirror = CubemapMirror(setup, base, own.weight_floor, where=held)
-    return Model(setup, (base, held, mirror), (*terms, scope_term(base, own, held)))
+    silent = Decision("no loss of the weights outside of the scope", "method.own.outside=0")
+    return Model(setup, (base, held, mirror), (*terms, scope_term(base, own, held) if own.outside > 0 else silent))
 
 
 def weight_of(gaussians: Gaussians) -> Tensor:

@@ -155,5 +155,13 @@ def test_each_block_of_published_numbers_says_where_it_stands(method: str):
     blocks = re.findall(r"^(\w+):(?:  (#.*))?$", text, re.MULTILINE)
     without = {name for name, comment in blocks if SOURCES[method] not in comment}
     assert without <= {"optics"}, without
-    for file in (conf_dir() / "method_on_scene" / "paper" / method).rglob("*.yaml"):
+    of_scenes = (conf_dir() / "method_on_scene" / "paper" / method).rglob("*.yaml")
+    for file in (*of_scenes, *(conf_dir() / "method_in_preset").glob(f"paper*_{method}.yaml")):
         assert SOURCES[method] in file.read_text(), file
+
+
+def test_published_schedules_of_kinds_of_scenes_are_all_looked_at():
+    """By the test above: each is named by its method."""
+    files = {file.stem for file in (conf_dir() / "method_in_preset").glob("paper*")}
+    assert files
+    assert all(any(name.endswith(f"_{method}") for method in SOURCES) for name in files)

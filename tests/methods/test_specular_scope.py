@@ -258,10 +258,11 @@ def test_a_stage_that_is_too_short_to_look_says_so():
     assert "too short" in said.why
 
 
-def test_a_loss_of_weight_0_makes_no_scope_and_that_is_said():
+def test_without_its_loss_the_scope_still_bounds_propagation_and_resets_and_that_is_said():
     method = new_method(settings("3dgs_dr", outside=0.0), tiny(), plan())
-    assert "scope" not in method.parts
-    assert "no scope, all may reflect: method.own.outside=0" in "; ".join(map(str, method.decisions))
+    assert "scope" in method.parts
+    assert "outside" not in {term.name for term in method.loss.terms}
+    assert "no loss of the weights outside of the scope: method.own.outside=0" in "; ".join(map(str, method.decisions))
 
 
 # ---- a training that finds the ball

@@ -124,6 +124,17 @@ def test_irradiance_is_the_cosine_integral_of_the_light():
     torch.testing.assert_close(light.irradiance(3 * normals), weights @ colors, atol=0.01, rtol=0.03)
 
 
+def test_irradiance_is_differentiated_as_often_as_it_is_asked_for():
+    light, group = light_of(method := begun()), method["reflection"].gaussians.sh_dc
+    found = []
+    for _ in range(2):
+        light.irradiance(directions(6)).sum().backward()
+        assert group.grad is not None
+        found.append(group.grad.clone())
+    assert float(found[0].abs().max()) > 0
+    torch.testing.assert_close(found[1], 2 * found[0])
+
+
 def test_the_exported_panorama_is_a_picture_of_it():
     method, frame = begun(), np.eye(3)
     found = bake_environment(method, STEP, PLACE.numpy().astype(float), NEAR, frame, 16)

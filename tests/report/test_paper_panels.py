@@ -111,4 +111,17 @@ def test_curves_of_a_scene_are_drawn_with_their_masks(tmp_path: Path):
     plain = [QualityCurve("sedan", "3dgs", "quick", 0, tuple(Look(k.steps, k.cpu_seconds, k.psnr) for k in looks))]
     both, alone = draw_time_quality(curves, tmp_path / "both"), draw_time_quality(plain, tmp_path / "alone")
     assert [path.suffix for path in both] == [".png", ".pdf"]
-    assert Image.open(both[0]).width > 1.5 * Image.open(alone[0]).width  # a second plot, of the masks
+    assert Image.open(both[0]).width > 1.4 * Image.open(alone[0]).width  # a second plot, of the masks
+
+
+def test_ten_methods_have_ten_colours(tmp_path: Path):
+    looks = tuple(Look(k, float(k), 20 + k**0.5) for k in (1, 4, 9, 25))
+    counts = []
+    for count in (1, 9, 10):
+        curves = [QualityCurve("sedan", f"method{each}", "quick", 0, looks) for each in range(count)]
+        picture, _ = draw_time_quality(curves, tmp_path / str(count))
+        pixels = np.asarray(Image.open(picture).convert("RGB")).reshape(-1, 3)
+        colors, times = np.unique(pixels, axis=0, return_counts=True)
+        vivid = (np.ptp(colors.astype(int), axis=1) > 60) & (times > 60)  # of the legend's lines too
+        counts.append(len({tuple(color) for color in colors[vivid]}))
+    assert counts[0] <= counts[1] - 7

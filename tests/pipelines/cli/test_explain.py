@@ -284,6 +284,16 @@ def test_explain_and_plan_know_the_files_of_a_folder_of_ones_own(own_configs: Pa
     assert "half" in capsys.readouterr().err
 
 
+def test_a_preset_of_ones_own_may_be_named_like_the_published_ones(own_configs: Path, capsys):
+    (own_configs / "preset").mkdir()
+    text = "# @package _global_\ndefaults:\n  - paper\n  - _self_\nmethod:\n  loss:\n    dssim: 0.125\n"
+    (own_configs / "preset" / "paper_mine.yaml").write_text(text, encoding="utf-8")
+    words = ["--config-dir", str(own_configs), "scene=demo", "method=2dgs", "preset=paper_mine"]
+    assert main(["explain", "method.loss.dssim", *words]) == 0
+    assert "0.125" in capsys.readouterr().out
+    assert main(["plan", *words]) == 0
+
+
 def test_a_folder_that_is_none_is_refused(capsys):
     for words in (["plan", "--config-dir", "/no/such"], ["explain", "--config-dir=/no/such"]):
         assert main(words) == 1
