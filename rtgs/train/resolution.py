@@ -1,4 +1,4 @@
-"""Views that grow: the first steps of a training see small pictures, later ones as much detail as they can learn.
+"""Views that grow: steps of a training see small pictures first, later as much detail as they can learn.
 
 DashGaussian (Chen et al., CVPR 2025, 2503.18402): a picture of 1/s of the size holds the middle 1/s of its spectrum. A
 size begins when the logarithm of the magnitude it holds is due, in even steps from the smallest size to the whole.
@@ -38,18 +38,20 @@ def spectrum_shares(views: Sequence[View], largest: int) -> tuple[float, ...]:
     return tuple(held / held[0]) if held[0] > 0 else (1.0,) * largest  # black photos: nothing is lost
 
 
-def factor_starts(shares: Sequence[float], until: int) -> tuple[tuple[int, int], ...]:
+def factor_starts(shares: Sequence[float], until: int, begin: int = 0) -> tuple[tuple[int, int], ...]:
     """(first step, factor), the factors falling to 1 at step ``until``; ``shares`` of the factors 1 .. S.
 
-    Factor s begins at until ln(E(s) / E(S)) / ln(E(1) / E(S)). The smallest pictures hold at least a quarter.
+    Factor s begins ln(E(s) / E(S)) / ln(E(1) / E(S)) of the way from step ``begin`` to ``until``; before ``begin``
+    views are whole. The smallest pictures hold at least a quarter.
     """
     held = [share for share in shares if share >= _LEAST_SHARE]
     whole = math.log(held[0] / held[-1])
     if whole <= 0:
         return ((0, 1),)
     counted = range(len(held), 0, -1)  # where two begin at once, the larger pictures are shown
-    begins = {round(until * math.log(held[factor - 1] / held[-1]) / whole): factor for factor in counted}
-    return tuple(begins.items())
+    way = until - begin
+    begins = {begin + round(way * math.log(held[factor - 1] / held[-1]) / whole): factor for factor in counted}
+    return tuple(({0: 1} | begins).items())
 
 
 def shrunk(view: View, factor: int) -> View:
@@ -83,7 +85,8 @@ class GrowingViews:
         self.starts: tuple[tuple[int, int], ...] = ((0, 1),)
         largest = self._largest(schedule.coarse)
         if largest > 1:
-            self.starts = factor_starts(spectrum_shares(views, largest), round(schedule.coarse_until * schedule.total))
+            begin, until = (round(share * schedule.total) for share in (schedule.coarse_from, schedule.coarse_until))
+            self.starts = factor_starts(spectrum_shares(views, largest), until, begin)
         self._factor = 1
         self._shrunk: dict[int, View] = {}
 

@@ -103,11 +103,14 @@ class ScheduleSettings:
     means_lr_steps: int = 30_000  # over which the learning rate of the centres falls
     evaluate_every: int = 0  # 0 = at the end only
     checkpoint_every: int = 500  # a killed run goes on from the last one
-    # Views of the first steps are shrunk by at most this factor, and grow until this share of the run (resolution.py).
+    # Views are shrunk by at most this factor, from one share of the run on, and grow until another (resolution.py).
     coarse: int = field(default=1, metadata=UNLESS_DEFAULT)
+    coarse_from: float = field(default=0.0, metadata=UNLESS_DEFAULT)
     coarse_until: float = field(default=0.5, metadata=UNLESS_DEFAULT)
 
     def __post_init__(self) -> None:
         refuse_unless(1 <= self.coarse <= 8, "schedule.coarse", self.coarse, "1 (no view is shrunk) to 8")
         until = self.coarse_until
         refuse_unless(0 < until <= 1, "schedule.coarse_until", until, "above 0 and at most 1")
+        told = f"at least 0 and below schedule.coarse_until={until}"
+        refuse_unless(0 <= self.coarse_from < until, "schedule.coarse_from", self.coarse_from, told)

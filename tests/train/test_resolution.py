@@ -117,9 +117,26 @@ def test_steps_see_larger_views_one_after_the_other_and_the_log_says_when():
     assert "1/1 from step 60" in str(decision)
 
 
-def test_a_run_goes_on_bit_for_bit_from_a_checkpoint_amid_small_views(tmp_path):
+def test_views_may_shrink_after_some_steps_on_whole_ones():
     scene = larger_scene()
-    schedule = small_schedule(total=30, coarse=4, coarse_until=0.8)
+    whole = scene.train[0].camera.width
+    growing = GrowingViews(scene.train, small_schedule(total=100, coarse=4, coarse_from=0.3, coarse_until=0.6))
+    first, *later = growing.starts
+    assert first == (0, 1)
+    assert later[0][0] == 30
+    assert later[-1] == (60, 1)
+    sizes = [growing.at(0, step).camera.width for step in range(100)]
+    assert set(sizes[:30]) == set(sizes[60:]) == {whole}
+    assert sizes[30:60] == sorted(sizes[30:60])
+    assert max(sizes[30:60]) < whole
+    at_once = GrowingViews(scene.train, small_schedule(total=30, coarse=4, coarse_until=1.0)).starts
+    assert [(step - 30, factor) for step, factor in later] == list(at_once)
+
+
+@pytest.mark.parametrize("first", [0.0, 0.3])
+def test_a_run_goes_on_bit_for_bit_from_a_checkpoint_amid_small_views(tmp_path, first: float):
+    scene = larger_scene()
+    schedule = small_schedule(total=30, coarse=4, coarse_from=first, coarse_until=0.8)
     whole = small_trainer(scene, schedule=schedule)
     whole.run()
     stopped = small_trainer(scene, schedule=schedule, checkpoint_dir=tmp_path)
@@ -132,7 +149,9 @@ def test_a_run_goes_on_bit_for_bit_from_a_checkpoint_amid_small_views(tmp_path):
         assert torch.equal(tensor, resumed.method.state()[name]), name
 
 
-@pytest.mark.parametrize(("key", "value"), [("coarse", 0), ("coarse", 9), ("coarse_until", 0.0), ("coarse_until", 1.5)])
+@pytest.mark.parametrize(
+    ("key", "value"), [("coarse", 0), ("coarse", 9), ("coarse_until", 0.0), ("coarse_until", 1.5), ("coarse_from", 0.5)]
+)
 def test_what_is_out_of_range_is_refused(key: str, value: float):
     with pytest.raises(RtgsError, match=rf"schedule\.{key}={value}"):
         ScheduleSettings(**{key: value})
