@@ -103,9 +103,11 @@ class ScheduleSettings:
     means_lr_steps: int = 30_000  # over which the learning rate of the centres falls
     evaluate_every: int = 0  # 0 = at the end only
     checkpoint_every: int = 500  # a killed run goes on from the last one
-    # Views are shrunk by at most this factor, from one share of the run on, and grow until another (resolution.py).
+    # Views are shrunk by at most this factor for a part of the run, and grow in it (resolution.py).
     coarse: int = field(default=1, metadata=UNLESS_DEFAULT)
+    # Share of the run from which on views are shrunk; before it they are whole.
     coarse_from: float = field(default=0.0, metadata=UNLESS_DEFAULT)
+    # Share of the run from which on they are whole again.
     coarse_until: float = field(default=0.5, metadata=UNLESS_DEFAULT)
 
     def __post_init__(self) -> None:

@@ -34,7 +34,6 @@ UNDESCRIBED = {
     "PoseSettings": "enabled",
     "ReflectionSettings": "alpha_cutoff background densify_every per_cell transmittance_cutoff",
     "RenderSettings": "background",
-    "ScheduleSettings": "coarse_until",
     "SegmenterSettings": "encoder",
     "SfmSettings": "min_photos seed",
     "TableConfig": "title",
