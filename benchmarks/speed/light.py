@@ -89,11 +89,15 @@ def parts(size: tuple[int, int], sides: tuple[int, ...], one_level: int) -> dict
         surface = torch.randn(len(directions), SURFACE, generator=generator).requires_grad_()
         weights = {name: each.requires_grad_() for name, each in first_weights(WIDTH, generator).items()}
         rest = (FEATURES, directions, roughness, surface)
-        levels = (FEATURES, directions, (FEATURES.bit_length() - 1) * roughness, surface)
+
+        def twin() -> Tensor:  # its levels are made in the call: what is made before has a gradient once
+            levels = (FEATURES.bit_length() - 1) * roughness
+            return mirrored_light_twin(weights, box_pyramid(texels), FEATURES, directions, levels, surface)
+
         return Part(
             (texels, directions, roughness, surface, *weights.values()),
             lambda: mirrored_light(weights, box_pyramid(texels), *rest),
-            lambda: mirrored_light_twin(weights, box_pyramid(texels), *levels),
+            twin,
         )
 
     return {

@@ -112,7 +112,7 @@ def test_speed_error_sweep_has_each_point_once() -> None:
 
 
 def test_light(run, monkeypatch: pytest.MonkeyPatch) -> None:
-    tiny = light.figures((8, 6), (16, 8, 4, 4), 8, calls=1)
+    tiny = light.figures((8, 6), (16, 8, 4, 4), 8, calls=2)  # a graph that is kept over calls has a gradient once
     monkeypatch.setattr(light, "figures", lambda: tiny | {f"lookup_128_{kind}": 1.0 for kind in ("ms", "torch_ms")})
     figures = run(light)
     parts = (*light.STEP, "step", "lookup_8")
