@@ -320,19 +320,27 @@ def _refuse_profile(path: Path) -> None:
 
 
 def _refuse_linear(images: Mapping[str, Tensor], views: Sequence[SeenView], folder: Path) -> None:
-    """Refuse pictures that fit the photos much better once encoded: they hold light.
+    """Refuse pictures that fit the photos much better once encoded: they hold light, all of them or some.
 
     Raises:
         ExternalError: they do.
     """
     stored, light = (
-        sum(psnr(change(images[view.name]), view.image) for view in views) / len(views)
-        for change in (lambda image: image, encoded)
+        [psnr(change(images[view.name]), view.image) for view in views] for change in (lambda image: image, encoded)
     )
-    if light - stored > _LINEAR_BY:
+    some = [view.name for view, low, high in zip(views, stored, light, strict=True) if high - low > _LINEAR_BY]
+    whole = (sum(light) - sum(stored)) / len(views) > _LINEAR_BY
+    if whole or len(some) == len(views):
         raise ExternalError(
-            f"external.renders={folder}: the pictures fit the photos with {stored:.1f} dB, and with {light:.1f} dB "
-            "when taken for linear light: set external.colors=linear if they are, else external.colors=srgb"
+            f"external.renders={folder}: the pictures fit the photos with {sum(stored) / len(views):.1f} dB, and with "
+            f"{sum(light) / len(views):.1f} dB when taken for linear light: set external.colors=linear if they are, "
+            "else external.colors=srgb"
+        )
+    if some:
+        raise ExternalError(
+            f"external.renders={folder}: {list_some(some)} fit their photos better by more than {_LINEAR_BY:.0f} dB "
+            "when taken for linear light, the other pictures do not: write all in one encoding, or set "
+            "external.colors=srgb if they are sRGB as they stand"
         )
 
 

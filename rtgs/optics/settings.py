@@ -20,9 +20,8 @@ Fresnel = Literal["schlick", "none", "dielectric", "conductor", "coated"]
 class OpticsSettings:
     """The weights in front of the traced colours (method.md 4.2 to 4.4; decisions 1 to 5)."""
 
-    # "literal": the paper's blend without the cosine; "split_sum": its ablation; "blend": w_r = 1, k_s alone says how
-    # much (3DGS-DR, EnvGS), written "envgs" in recipes, as ever, and good under both names; "additive": as well, and
-    # nothing is taken from C_d: C_d + k_s C_r.
+    # "literal": the paper's blend without the cosine; "split_sum": its ablation; "blend" or "envgs": w_r = 1 and k_s
+    # alone weighs (3DGS-DR, EnvGS); "additive": the same with nothing taken from C_d: C_d + k_s C_r.
     weight: Weight = "microfacet"
     # S_max, bound of the microfacet gain: 1 conserves energy and is nearly the same from all angles, 0 = no bound (the
     # paper); decision 5.

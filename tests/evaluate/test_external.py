@@ -152,6 +152,17 @@ def test_linear_light_is_told_from_srgb_by_the_photos(tmp_path: Path):
     assert torch.equal(kept, VIEWS[0].image)
 
 
+def test_one_picture_of_linear_light_among_others_is_named(tmp_path: Path):
+    photos = tuple(Photo(view.name, view.camera, encoded(view.image)) for view in VIEWS)
+    (tmp_path / "left").mkdir()
+    for index, (view, photo) in enumerate(zip(VIEWS, photos, strict=True)):
+        shown = photo.image if index else view.image
+        np.save(tmp_path / f"{view.name[:-4]}.npy", shown.numpy().transpose(1, 2, 0))
+    with pytest.raises(ExternalError, match=rf"{VIEWS[0].name} fit.* by more than 3 dB when taken for linear light"):
+        read_external(settings(tmp_path), photos)
+    read_external(settings(tmp_path, colors="srgb"), photos)
+
+
 @pytest.mark.parametrize(
     ("values", "message"),
     [
