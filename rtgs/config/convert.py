@@ -13,6 +13,7 @@ from omegaconf.errors import OmegaConfBaseException
 from rtgs.config.keys import value_of
 from rtgs.config.locate import choices_of, conf_dir
 from rtgs.config.names import derive_name, run_name
+from rtgs.config.opened import more_choices
 from rtgs.config.schema import Choices, RunConfig
 from rtgs.config.words import FOLDER_CHOICE, quoted, unresolved
 from rtgs.core.build import build
@@ -102,8 +103,8 @@ def _refuse_preset_of_others(config: RunConfig, choices: Choices) -> None:
     Raises:
         RtgsError: the method has none.
     """
-    preset, method = choices.preset, config.method.name
-    if _has_preset(method, preset):
+    preset, method = choices.preset, choices.method or config.method.name
+    if pictures_only(config) or _has_preset(method, preset):
         return
     fit = [spec.name for spec in own_methods() if _has_preset(spec.name, preset)]
     raise RtgsError(
@@ -113,9 +114,9 @@ def _refuse_preset_of_others(config: RunConfig, choices: Choices) -> None:
 
 
 def _has_preset(method: str, preset: str) -> bool:
-    """Those of a folder of one's own are not known, and hold for all."""
+    """``method`` is the name of its file. Presets of a folder of one's own hold for all."""
     shipped = preset.startswith("paper_") and preset in choices_of("preset")
-    return not shipped or f"{preset}_{method}" in choices_of("method_in_preset")
+    return not shipped or f"{preset}_{method}" in (*choices_of("method_in_preset"), *more_choices("method_in_preset"))
 
 
 def _refuse_idle_ablation(config: RunConfig, choices: Choices) -> None:

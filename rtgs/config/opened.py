@@ -84,6 +84,16 @@ def with_configs(more: Path | None) -> Iterator[None]:
         _more.reset(token)
 
 
+def more_choices(group: str) -> list[str]:
+    """Names that can be chosen from a config group where Hydra looks, those of ``--config-dir`` among them."""
+    from hydra.core.global_hydra import GlobalHydra
+
+    hydra, more = GlobalHydra.instance(), _more.get()
+    if hydra.is_initialized():
+        return hydra.config_loader().get_group_options(group)
+    return [] if more is None else sorted(path.stem for path in (more / group).glob("*.yaml"))
+
+
 @contextmanager
 def opened_configs() -> Iterator[None]:
     """Hydra's global state over ``conf/``, as it was before when the block ends."""

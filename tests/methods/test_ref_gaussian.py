@@ -85,7 +85,7 @@ def test_the_published_numbers_for_synthetic_scenes():
     assert replace(reflection, start=0.15, propagation=real.method.reflection.propagation) == real.method.reflection
 
 
-@pytest.mark.parametrize("method", ["3dgs_dr", "rtgs", "external"])
+@pytest.mark.parametrize("method", ["3dgs_dr", "rtgs"])
 def test_methods_without_a_schedule_for_synthetic_scenes_refuse_it(method: str):
     message = f"preset=paper_synthetic has nothing of method {method}: it is for ref_gaussian; preset=paper"
     with pytest.raises(RtgsError, match=message):

@@ -293,6 +293,21 @@ def test_a_preset_of_ones_own_may_be_named_like_the_published_ones(own_configs: 
     assert main(["plan", *words]) == 0
 
 
+def test_a_method_of_ones_own_has_the_published_presets_that_it_has_a_file_for(own_configs: Path, capsys):
+    (own_configs / "method").mkdir()
+    (own_configs / "method" / "mine.yaml").write_text("defaults:\n  - ref_gaussian\n", encoding="utf-8")
+    words = ["--config-dir", str(own_configs), "scene=demo", "method=mine", "preset=paper_synthetic"]
+    assert main(["plan", *words]) == 1
+    assert "preset=paper_synthetic has nothing of method mine" in capsys.readouterr().err
+    (own_configs / "method_in_preset").mkdir()
+    text = "# @package _global_\ndefaults:\n  - paper_synthetic_ref_gaussian\n"
+    (own_configs / "method_in_preset" / "paper_synthetic_mine.yaml").write_text(text, encoding="utf-8")
+    assert main(["plan", *words]) == 0
+    capsys.readouterr()
+    assert main(["explain", "method.own.forward_until", *words]) == 0
+    assert "0.36" in capsys.readouterr().out
+
+
 def test_a_folder_that_is_none_is_refused(capsys):
     for words in (["plan", "--config-dir", "/no/such"], ["explain", "--config-dir=/no/such"]):
         assert main(words) == 1
