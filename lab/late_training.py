@@ -208,19 +208,18 @@ class Session:
         seconds = self.trainer(model, 0, self.total).run().cpu_seconds
         return self.score(model, f"{least} of {VOTERS} views agree", seconds)
 
-    def run(self, levers: Sequence[str], tell: Callable[[LeverScore], None]) -> None:
-        """Every lever asked for, told as it comes."""
+    def run(self, levers: Sequence[str], agree: Sequence[int], tell: Callable[[LeverScore], None]) -> None:
+        """Every lever asked for, told as it comes; ``agree``: how many views must, of the vote."""
         prefix = self.prefix()
         for score in self.plain(prefix, means="mean" in levers):
             tell(score)
-        several = [("views", f"{k} views a step, as many views", dict(views=k, advance=k)) for k in (2, 4)]
-        several += [("steps", "2 views a step, as many steps", dict(views=2))]
-        for lever, name, choice in several:
+        several = [("views", f"{k} views a step, as many views", k, k) for k in (2, 4)]
+        for lever, name, views, advance in (*several, ("steps", "2 views a step, as many steps", 2, 1)):
             if lever in levers:
-                tell(self.score(*_named(self.tail(prefix, **choice), name)))
+                tell(self.score(*_named(self.tail(prefix, views=views, advance=advance), name)))
         for share in (0.1, 0.3) if "prune" in levers else ():
             tell(self.score(*_named(self.tail(prefix, prune=share), f"{share:.0%} pruned at {PRUNE_AT:.0%}")))
-        for least in (2, 4) if "vote" in levers else ():
+        for least in agree if "vote" in levers else ():
             tell(self.vote(least))
 
 
@@ -235,6 +234,7 @@ def main() -> None:
     parser.add_argument("--methods", nargs="+", default=["3dgs"], help="of one stage")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--levers", nargs="*", default=LEVERS, choices=LEVERS)
+    parser.add_argument("--agree", nargs="+", type=int, default=[2, 4], help=f"of {VOTERS} views, in the vote")
     parser.add_argument("--set", default="", metavar="WORDS", help="config words of every run, in one string")
     options = parser.parse_args()
     torch.set_num_threads(1)
@@ -246,7 +246,7 @@ def main() -> None:
         print(score.row(), flush=True)
 
     for scene, method, seed in itertools.product(options.scenes, options.methods, options.seeds):
-        Session(scene, method, seed, options.set.split()).run(options.levers, tell)
+        Session(scene, method, seed, options.set.split()).run(options.levers, options.agree, tell)
     print(json.dumps({"machine": machine(), "scores": [asdict(score) for score in scores]}))
 
 
