@@ -133,6 +133,9 @@ class DensitySettings:
     # The cap is at most this times the pixels of the largest training view (more cannot be told apart, and fit noise);
     # None: no such bound, as published.
     max_per_pixel: float | None = None
+    # The cap is at most this times the points of the scene from which the Gaussians start: where photos agree on few,
+    # more Gaussians fit each photo for itself (docs/lab/training.md). None: no such bound, as published.
+    max_per_point: float | None = field(default=None, metadata=UNLESS_DEFAULT)
     cap_share: float = 0.9  # above this share of max_surfels (the cap) the lowest mean weights go
     # Share of the cap that one call may add beyond it, highest signals first, before the lowest weights go. None: any
     # number, as in EnvGS, which hardly meets its cap; presets with a small cap set it, or half of their set would
@@ -151,8 +154,10 @@ class DensitySettings:
         refuse_outside(self, "method.density", 0, 1, "reset_opacity", open_low=True)
         if self.cap_turnover is not None:
             refuse_outside(self, "method.density", 0, math.inf, "cap_turnover")
-        if self.max_per_pixel is not None:
-            refuse_unless(self.max_per_pixel > 0, "density.max_per_pixel", self.max_per_pixel, "above 0, or null")
+        for name in ("max_per_pixel", "max_per_point"):
+            share = getattr(self, name)
+            if share is not None:
+                refuse_unless(share > 0, f"density.{name}", share, "above 0, or null")
 
 
 @dataclass(frozen=True)

@@ -66,13 +66,14 @@ def create_method(
         A method from outside builds something else than a model.
     """
     from rtgs.methods.model import Model
-    from rtgs.methods.parts.pixel_bound import bound_by_pixels
+    from rtgs.methods.parts.count_bounds import SceneCounts, bound_counts
 
     spec = find_method(settings.name)
     if object_mesh is not None and spec.object_stage(settings) is None:
         raise ValueError(f"method {spec.name} has no stage that takes an object mesh, or it is switched off")
     pixels = max((view.camera.width * view.camera.height for view in scene.train), default=0)
-    settings, lowered = bound_by_pixels(settings.in_scene(glass=object_mesh is not None), pixels)
+    counts = SceneCounts(pixels, len(scene.points) if settings.init.random_points == 0 else None)
+    settings, lowered = bound_counts(settings.in_scene(glass=object_mesh is not None), counts)
     decisions = (*lowered, *spec.unread_losses(settings))
     stages = spec.timeline(settings, schedule, transparent=object_mesh is not None)
     made = spec.build(

@@ -40,6 +40,7 @@ DENSITY = {  # of both sets
     "cap_share": 0.9,
     "cap_turnover": None,
     "max_per_pixel": None,
+    "max_per_point": None,
 }
 PROPAGATION = {
     "every": 1000,
