@@ -3,7 +3,8 @@
 ``python -m lab.late_training --scenes matte_room fox --methods 3dgs --seeds 0 1 2``
 
 One training goes to the end of density control; every late lever goes on from there, so differences are those of the
-last part alone. The vote, which changes density control, is a run of its own. Every eighth view of the training split
+last part alone. The vote, which changes density control, a random background and a far shell of points, which are there
+from the start, are runs of their own. Every eighth view of the training split
 is held out and judged; test views are never looked at. CPU seconds are of the whole run, without looks. A Markdown
 table grows on the screen, last line: a JSON object.
 """
@@ -21,7 +22,15 @@ from typing import TYPE_CHECKING
 import torch
 
 from benchmarks.common.machine import machine
-from lab.late_levers import Averages, SeveralViewsTrainer, consolidate, let_vote, swapped
+from lab.late_levers import (
+    Averages,
+    RandomBackground,
+    SeveralViewsTrainer,
+    consolidate,
+    let_vote,
+    swapped,
+    with_shell,
+)
 from lab.training_choices import judged_in_training
 from rtgs.train.method import Mode
 from rtgs.train.schedule import densify_end
@@ -36,7 +45,8 @@ if TYPE_CHECKING:
 PRUNE_AT = 0.8  # of the run
 VOTERS = 8  # views that are asked in each call of density control
 HEADER = "| scene | method | seed | lever | PSNR | SSIM | Gaussians | CPU s |"
-LEVERS = ("mean", "views", "steps", "prune", "vote")
+SHELL_POINTS, SHELL_DISTANCE = 1000, 5.0  # of the far shell; scene extents
+LEVERS = ("mean", "views", "steps", "prune", "vote", "background", "shell")
 
 
 @dataclass(frozen=True)
@@ -126,21 +136,26 @@ class Session:
         self.total = self.config.schedule.total
         self.looks = Looks(self.scene, max(self.total // 40, 1))
 
-    def create(self) -> Model:
-        """A model that nothing has trained."""
+    def create(self, scene: Scene | None = None) -> Model:
+        """A model that nothing has trained; of another ``scene`` if that is given."""
         from rtgs.methods import create_method
         from rtgs.methods.model import Model
         from rtgs.train.seeds import generator_for
 
         config = self.config
-        method = create_method(config.method, self.unseen, config.schedule, generator_for(config.seed, "initialise"))
+        generator = generator_for(config.seed, "initialise")
+        method = create_method(config.method, scene or self.unseen, config.schedule, generator)
         assert isinstance(method, Model)
         if len(method.stages) > 1:
             raise SystemExit(f"method {method.name} has {len(method.stages)} stages; choose one of one stage, 2dgs")
         return method
 
     def trainer(
-        self, model: Model, from_step: int, until: int, observer: Looks | Averages | Both | None = None
+        self,
+        model: Model,
+        from_step: int,
+        until: int,
+        observer: Looks | Averages | Both | RandomBackground | None = None,
     ) -> SeveralViewsTrainer:
         """Of these steps."""
         stage = replace(model.stages[0], from_step=from_step, until=until)
@@ -208,6 +223,20 @@ class Session:
         seconds = self.trainer(model, 0, self.total).run().cpu_seconds
         return self.score(model, f"{least} of {VOTERS} views agree", seconds)
 
+    def background(self) -> LeverScore:
+        """A run with another background in every step."""
+        model = self.create()
+        own = model.base._background
+        seconds = self.trainer(model, 0, self.total, RandomBackground(self.config.seed)).run().cpu_seconds
+        model.base._background = own
+        return self.score(model, "random background", seconds)
+
+    def shell(self) -> LeverScore:
+        """A run with points on a far sphere around the cameras."""
+        model = self.create(with_shell(self.unseen, SHELL_POINTS, SHELL_DISTANCE))
+        seconds = self.trainer(model, 0, self.total).run().cpu_seconds
+        return self.score(model, f"a far shell of {SHELL_POINTS:,} points", seconds)
+
     def run(self, levers: Sequence[str], agree: Sequence[int], tell: Callable[[LeverScore], None]) -> None:
         """Every lever asked for, told as it comes; ``agree``: how many views must, of the vote."""
         prefix = self.prefix()
@@ -221,6 +250,10 @@ class Session:
             tell(self.score(*_named(self.tail(prefix, prune=share), f"{share:.0%} pruned at {PRUNE_AT:.0%}")))
         for least in agree if "vote" in levers else ():
             tell(self.vote(least))
+        if "background" in levers:
+            tell(self.background())
+        if "shell" in levers:
+            tell(self.shell())
 
 
 def _named(run: tuple[Model, float], name: str) -> tuple[Model, str, float]:

@@ -10,6 +10,7 @@ import torch
 from lab import late_training
 from lab.late_levers import (
     Averages,
+    RandomBackground,
     SeveralViewsTrainer,
     VotedDensity,
     bad_pixels,
@@ -20,6 +21,7 @@ from lab.late_levers import (
     swapped,
     votes,
     weights_on,
+    with_shell,
 )
 from lab.late_training import Session
 from rtgs.methods.model import Model
@@ -176,3 +178,37 @@ def test_every_lever_is_measured(run) -> None:
     assert best["psnr"] >= plain["psnr"]
     assert scores["2 views a step, as many views"]["psnr"] != plain["psnr"]
     assert scores["mean of the last 20%"]["psnr"] != plain["psnr"]
+
+
+def test_the_background_is_another_in_every_step_and_its_own_afterwards(session, monkeypatch) -> None:
+    colors: list[torch.Tensor] = []
+    own = RandomBackground.look
+
+    def look(self, method: Model, step: int) -> None:
+        own(self, method, step)
+        colors.append(method.base._background)
+
+    monkeypatch.setattr(RandomBackground, "look", look)
+    judged: list[torch.Tensor] = []
+    judge = late_training.judge
+    monkeypatch.setattr(
+        late_training, "judge", lambda method, *rest: (judged.append(method.base._background), judge(method, *rest))[1]
+    )
+    score = session.background()
+    assert len({tuple(color.tolist()) for color in colors}) == session.total
+    assert torch.equal(judged[0], session.create().base._background)
+    assert 5 < score.psnr < 40
+
+
+def test_the_shell_is_even_and_far(session) -> None:
+    scene = session.unseen
+    more = with_shell(scene, 500, 5.0)
+    added = more.points[len(scene.points) :]
+    center = torch.stack([view.camera.center for view in scene.train]).mean(0).float()
+    away = added - center
+    assert torch.allclose(away.norm(dim=1), torch.tensor(5 * scene.extent), rtol=1e-4)
+    assert (away.mean(0).norm() / away.norm(dim=1).mean()) < 0.01
+    nearest = torch.cdist(away, away).fill_diagonal_(torch.inf).min(1).values
+    assert nearest.min() > 0.5 * nearest.max()
+    assert len(more.point_colors) == len(more.points)
+    assert session.shell().gaussians > 0
