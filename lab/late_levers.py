@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import fields, replace
+from dataclasses import fields
 from typing import TYPE_CHECKING
 
 import torch
@@ -24,7 +23,7 @@ from rtgs.train.schedule import densify_ahead
 from rtgs.train.trainer import Trainer
 
 if TYPE_CHECKING:
-    from rtgs.scenes.scene import Scene, View
+    from rtgs.scenes.scene import View
 
 BAD_SHARE = 0.2  # of the pixels of a view: those of the largest error
 CONTRIBUTES = 0.5  # summed weight on them, in pixels, from which on a Gaussian contributes
@@ -109,22 +108,6 @@ class RandomBackground:
         """Draw the colour of the step after ``step``."""
         assert isinstance(method, Model)
         method.base._background = torch.rand(3, generator=self._generator)
-
-
-def with_shell(scene: Scene, count: int, distance: float) -> Scene:
-    """The scene with ``count`` more points of the photos' mean colour, even on a sphere around the cameras.
-
-    ``distance`` in scene extents.
-    """
-    place = torch.arange(count, dtype=torch.float64) + 0.5
-    height, turn = 1 - 2 * place / count, place * math.pi * (1 + 5**0.5)  # a Fibonacci lattice
-    width = (1 - height.square()).sqrt()
-    unit = torch.stack((width * turn.cos(), width * turn.sin(), height), 1)
-    center = torch.stack([view.camera.center.double() for view in scene.train]).mean(0)
-    points = (center + distance * scene.extent * unit).float()
-    color = torch.stack([view.image.mean((1, 2)) for view in scene.train]).mean(0)
-    colors = torch.cat((scene.point_colors, color.expand(count, 3)))
-    return replace(scene, points=torch.cat((scene.points, points)), point_colors=colors)
 
 
 def parameters(method: Method) -> list[Tensor]:

@@ -29,7 +29,6 @@ from lab.late_levers import (
     consolidate,
     let_vote,
     swapped,
-    with_shell,
 )
 from lab.training_choices import judged_in_training
 from rtgs.train.method import Mode
@@ -38,6 +37,7 @@ from rtgs.train.schedule import densify_end
 if TYPE_CHECKING:
     from rtgs.config.schema import RunConfig
     from rtgs.methods.model import Model
+    from rtgs.methods.settings import MethodSettings
     from rtgs.scenes.scene import Scene
     from rtgs.train.method import Method
     from rtgs.train.view_order import OrderState
@@ -136,15 +136,15 @@ class Session:
         self.total = self.config.schedule.total
         self.looks = Looks(self.scene, max(self.total // 40, 1))
 
-    def create(self, scene: Scene | None = None) -> Model:
-        """A model that nothing has trained; of another ``scene`` if that is given."""
+    def create(self, settings: MethodSettings | None = None) -> Model:
+        """A model that nothing has trained; of other ``settings`` than the run's if they are given."""
         from rtgs.methods import create_method
         from rtgs.methods.model import Model
         from rtgs.train.seeds import generator_for
 
         config = self.config
         generator = generator_for(config.seed, "initialise")
-        method = create_method(config.method, scene or self.unseen, config.schedule, generator)
+        method = create_method(settings or config.method, self.unseen, config.schedule, generator)
         assert isinstance(method, Model)
         if len(method.stages) > 1:
             raise SystemExit(f"method {method.name} has {len(method.stages)} stages; choose one of one stage, 2dgs")
@@ -233,7 +233,9 @@ class Session:
 
     def shell(self) -> LeverScore:
         """A run with points on a far sphere around the cameras."""
-        model = self.create(with_shell(self.unseen, SHELL_POINTS, SHELL_DISTANCE))
+        own = self.config.method
+        init = replace(own.init, shell_points=SHELL_POINTS, shell_distance=SHELL_DISTANCE)
+        model = self.create(replace(own, init=init))
         seconds = self.trainer(model, 0, self.total).run().cpu_seconds
         return self.score(model, f"a far shell of {SHELL_POINTS:,} points", seconds)
 

@@ -44,11 +44,13 @@ def gaussians_from_points(
     *,
     box: Tensor | None = None,
     channels: tuple[Channel, ...] = (),
+    more: tuple[Tensor, Tensor] | None = None,
 ) -> Kind:
     """One Gaussian for each point: round, scale from its neighbours, colour from the point, orientation as asked for.
 
     Points with a NaN or inf coordinate are left out. With ``settings.random_points`` > 0 the points are replaced by
-    that many uniform random ones of random colour in ``box``, or else in the box of the points.
+    that many uniform random ones of random colour in ``box``, or else in the box of the points. Points that are no
+    part of the reconstruction (:mod:`rtgs.gaussians.shell`) come last, as ``more``.
 
     Parameters
     ----------
@@ -66,6 +68,8 @@ def gaussians_from_points(
         Lowest and highest corner, world; only for random points.
     channels : tuple of Channel, optional
         What the Gaussians hold besides, at their initial values.
+    more : ((Q, 3) Tensor, (Q, 3) Tensor), optional
+        Points and colours that join the others, and count neither for their box nor for ``settings.min_points``.
 
     Returns
     -------
@@ -100,6 +104,8 @@ def gaussians_from_points(
             f"only {len(points)} of {len(usable)} points are usable, but init.min_points is {settings.min_points}: "
             "check the reconstruction (are the images registered?), or ask for random points: init.random_points=20000"
         )
+    if more is not None:
+        points, colors = (torch.cat(pair) for pair in zip((points, colors), more, strict=True))
     count = len(points)
     scale = settings.scale * neighbor_distance(points, settings.neighbors)
     if settings.orientation == "pca":

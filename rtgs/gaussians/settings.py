@@ -28,12 +28,17 @@ class InitSettings:
     neighbors: int = 3
     min_points: int = 10  # fewer usable points than this: the capture is refused (or random points, if asked for)
     random_points: int = 0  # > 0: ignore the scene's points, draw this many in the scene box
+    # More points of the base set, on a far sphere around the cameras, in the photos' mean colour; 0: none. They stand
+    # for sky and walls that no point of the reconstruction does.
+    shell_points: int = field(default=0, metadata=UNLESS_DEFAULT)
+    shell_distance: float = field(default=5.0, metadata=UNLESS_DEFAULT)  # of the cameras' mean, scene extents
 
     def __post_init__(self) -> None:
         refuse_unknown_words(self, "init")
         refuse_bad_counts(self, "init")
         refuse_outside(self, "init", 0, 1, "opacity", open_low=True)
         refuse_outside(self, "init", 0, math.inf, "scale", open_low=True)
+        refuse_outside(self, "init", 0, math.inf, "shell_distance", open_low=True)
         refuse_outside(self, "init", 0, 3, "sh_degree")
 
 

@@ -21,9 +21,8 @@ from lab.late_levers import (
     swapped,
     votes,
     weights_on,
-    with_shell,
 )
-from lab.late_training import Session
+from lab.late_training import SHELL_POINTS, Session
 from rtgs.methods.model import Model
 from rtgs.train.method import Mode
 
@@ -200,15 +199,17 @@ def test_the_background_is_another_in_every_step_and_its_own_afterwards(session,
     assert 5 < score.psnr < 40
 
 
-def test_the_shell_is_even_and_far(session) -> None:
-    scene = session.unseen
-    more = with_shell(scene, 500, 5.0)
-    added = more.points[len(scene.points) :]
-    center = torch.stack([view.camera.center for view in scene.train]).mean(0).float()
-    away = added - center
-    assert torch.allclose(away.norm(dim=1), torch.tensor(5 * scene.extent), rtol=1e-4)
-    assert (away.mean(0).norm() / away.norm(dim=1).mean()) < 0.01
-    nearest = torch.cdist(away, away).fill_diagonal_(torch.inf).min(1).values
-    assert nearest.min() > 0.5 * nearest.max()
-    assert len(more.point_colors) == len(more.points)
-    assert session.shell().gaussians > 0
+def test_the_shell_is_there_from_the_start(session, monkeypatch) -> None:
+    monkeypatch.setattr(Session, "trainer", lambda *rest: _Idle())
+    score = session.shell()
+    assert score.gaussians == len(session.create().base.set) + SHELL_POINTS
+    assert score.cpu_seconds == 0
+
+
+class _Idle:
+    """Trains nothing."""
+
+    cpu_seconds = 0.0
+
+    def run(self) -> _Idle:
+        return self

@@ -14,7 +14,8 @@ from rtgs.core.decisions import Decision
 from rtgs.gaussians.initialize import gaussians_from_points
 from rtgs.gaussians.normals import NORMAL_RESIDUAL
 from rtgs.gaussians.primitives import Gaussians
-from rtgs.gaussians.settings import DensitySettings, McmcSettings
+from rtgs.gaussians.settings import DensitySettings, InitSettings, McmcSettings
+from rtgs.gaussians.shell import far_shell
 from rtgs.gaussians.smoothing import REFRESH_EVERY, Smoothing
 from rtgs.gaussians.surfels import ActivatedGaussians
 from rtgs.methods.parts.gaussian_set import GaussianSet, densified, opacity_reset
@@ -36,6 +37,7 @@ from rtgs.train.settings import ScheduleSettings
 
 if TYPE_CHECKING:
     from rtgs.methods.spec import Setup
+    from rtgs.scenes.scene import Scene
 
 
 class BaseRules(Protocol):
@@ -93,7 +95,9 @@ class BaseSet(Part):
             init = replace(init, opacity=self.mcmc.init_opacity, scale=self.mcmc.init_scale)
         self.set = GaussianSet(
             self.name,
-            gaussians_from_points(kind.type, scene.points, scene.point_colors, init, setup.generator),
+            gaussians_from_points(
+                kind.type, scene.points, scene.point_colors, init, setup.generator, more=_shell(init, scene)
+            ),
             optimizer=settings.optimizer,
             density=settings.density,
             means_lr_steps=setup.schedule.means_lr_steps,
@@ -238,6 +242,16 @@ def mcmc_of(density: DensitySettings) -> McmcSettings | None:
 def composited(gaussians: Gaussians, colors: Tensor) -> Tensor:
     """(N, C) what is composited of a set: SH colours (N, 3), then every channel as it is activated, in its order."""
     return named_features(gaussians, colors)[1] if gaussians.channels else colors
+
+
+def _shell(init: InitSettings, scene: Scene) -> tuple[Tensor, Tensor] | None:
+    """Points and colours of the far shell."""
+    if init.shell_points == 0:
+        return None
+    centers = torch.stack([view.camera.center for view in scene.train])
+    color = torch.stack([view.image.mean((1, 2)) for view in scene.train]).mean(0)
+    points = far_shell(init.shell_points, init.shell_distance, centers, scene.extent)
+    return points, color.expand(len(points), 3)
 
 
 def _joined(base: Rows, appended: Sequence[Rows]) -> tuple[ActivatedGaussians, Tensor]:
