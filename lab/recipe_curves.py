@@ -81,6 +81,7 @@ def draw(pairs: list[Pair], labels: tuple[str, str], path: Path) -> None:
     """Write the picture: a plot for each scene."""
     from matplotlib import colormaps
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator, NullFormatter
 
     scenes = list(dict.fromkeys(pair.after.scene for pair in pairs))
     kinds = list(dict.fromkeys((pair.after.method, pair.after.preset) for pair in pairs))
@@ -98,6 +99,9 @@ def draw(pairs: list[Pair], labels: tuple[str, str], path: Path) -> None:
                 handles[f"{', '.join(kind)}: {label}"] = drawn
         axes.set_title(scene, fontsize="medium")
         axes.set(xscale="log")
+        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_formatter(NullFormatter())
         axes.grid(alpha=0.3)
     figure.supxlabel("CPU seconds of training")
     figure.supylabel("PSNR, dB")

@@ -31,7 +31,7 @@ class InitSettings:
     # More points of the base set, on a far sphere around the cameras, in the photos' mean colour; 0: none. They stand
     # for sky and walls that no point of the reconstruction does.
     shell_points: int = field(default=0, metadata=UNLESS_DEFAULT)
-    shell_distance: float = field(default=5.0, metadata=UNLESS_DEFAULT)  # of the cameras' mean, scene extents
+    shell_distance: float = field(default=10.0, metadata=UNLESS_DEFAULT)  # of the cameras' mean, scene extents
 
     def __post_init__(self) -> None:
         refuse_unknown_words(self, "init")
