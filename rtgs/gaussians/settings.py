@@ -42,7 +42,7 @@ class InitSettings:
         refuse_outside(self, "init", 0, 3, "sh_degree")
 
     def refuse_shell(self, key: str) -> None:
-        """Raises :class:`rtgs.core.errors.RtgsError` where a set without a far shell is asked for one; ``key``: its start."""
+        """Raises :class:`rtgs.core.errors.RtgsError` where a set that has no far shell is asked for one."""
         refuse_unless(self.shell_points == 0, f"{key}.shell_points", self.shell_points, "0: the base set alone has one")
 
 
