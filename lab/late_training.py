@@ -3,10 +3,9 @@
 ``python -m lab.late_training --scenes matte_room fox --methods 3dgs --seeds 0 1 2``
 
 One training goes to the end of density control; every late lever goes on from there, so differences are those of the
-last part alone. The vote, which changes density control, a random background and a far shell of points, which are there
-from the start, are runs of their own. Every eighth view of the training split
-is held out and judged; test views are never looked at. CPU seconds are of the whole run, without looks. A Markdown
-table grows on the screen, last line: a JSON object.
+last part alone. The vote, which changes density control, and a random background are runs of their own. Every eighth
+view of the training split is held out and judged; test views are never looked at. CPU seconds are of the whole run,
+without looks. A Markdown table grows on the screen, last line: a JSON object.
 """
 
 from __future__ import annotations
@@ -37,7 +36,6 @@ from rtgs.train.schedule import densify_end
 if TYPE_CHECKING:
     from rtgs.config.schema import RunConfig
     from rtgs.methods.model import Model
-    from rtgs.methods.settings import MethodSettings
     from rtgs.scenes.scene import Scene
     from rtgs.train.method import Method
     from rtgs.train.view_order import OrderState
@@ -45,8 +43,7 @@ if TYPE_CHECKING:
 PRUNE_AT = 0.8  # of the run
 VOTERS = 8  # views that are asked in each call of density control
 HEADER = "| scene | method | seed | lever | PSNR | SSIM | Gaussians | CPU s |"
-SHELL_POINTS, SHELL_DISTANCE = 1000, 5.0  # of the far shell; scene extents
-LEVERS = ("mean", "views", "steps", "prune", "vote", "background", "shell")
+LEVERS = ("mean", "views", "steps", "prune", "vote", "background")
 
 
 @dataclass(frozen=True)
@@ -136,15 +133,15 @@ class Session:
         self.total = self.config.schedule.total
         self.looks = Looks(self.scene, max(self.total // 40, 1))
 
-    def create(self, settings: MethodSettings | None = None) -> Model:
-        """A model that nothing has trained; of other ``settings`` than the run's if they are given."""
+    def create(self) -> Model:
+        """A model that nothing has trained."""
         from rtgs.methods import create_method
         from rtgs.methods.model import Model
         from rtgs.train.seeds import generator_for
 
         config = self.config
         generator = generator_for(config.seed, "initialise")
-        method = create_method(settings or config.method, self.unseen, config.schedule, generator)
+        method = create_method(config.method, self.unseen, config.schedule, generator)
         assert isinstance(method, Model)
         if len(method.stages) > 1:
             raise SystemExit(f"method {method.name} has {len(method.stages)} stages; choose one of one stage, 2dgs")
@@ -226,18 +223,11 @@ class Session:
     def background(self) -> LeverScore:
         """A run with another background in every step."""
         model = self.create()
-        own = model.base._background
-        seconds = self.trainer(model, 0, self.total, RandomBackground(self.config.seed)).run().cpu_seconds
+        own, random = model.base._background, RandomBackground(self.config.seed)
+        random.look(model, 0)
+        seconds = self.trainer(model, 0, self.total, random).run().cpu_seconds
         model.base._background = own
         return self.score(model, "random background", seconds)
-
-    def shell(self) -> LeverScore:
-        """A run with points on a far sphere around the cameras."""
-        own = self.config.method
-        init = replace(own.init, shell_points=SHELL_POINTS, shell_distance=SHELL_DISTANCE)
-        model = self.create(replace(own, init=init))
-        seconds = self.trainer(model, 0, self.total).run().cpu_seconds
-        return self.score(model, f"a far shell of {SHELL_POINTS:,} points", seconds)
 
     def run(self, levers: Sequence[str], agree: Sequence[int], tell: Callable[[LeverScore], None]) -> None:
         """Every lever asked for, told as it comes; ``agree``: how many views must, of the vote."""
@@ -254,8 +244,6 @@ class Session:
             tell(self.vote(least))
         if "background" in levers:
             tell(self.background())
-        if "shell" in levers:
-            tell(self.shell())
 
 
 def _named(run: tuple[Model, float], name: str) -> tuple[Model, str, float]:

@@ -40,7 +40,7 @@ class Pair:
         """A line of the table."""
         ends = [curve.looks[-1] for curve in (self.before, self.after)]
         caught = "never" if self.caught_up is None else f"{self.caught_up:.0f}"
-        cells = [self.after.scene, f"{self.after.method}, {self.after.preset}"]
+        cells = [self.after.scene, self.after.label]
         cells += [f"{end.psnr:.2f}, {end.cpu_seconds:.0f} s" for end in ends]
         cells += [f"{ends[1].psnr - ends[0].psnr:+.2f}", caught]
         return f"| {' | '.join(cells)} |"
@@ -84,19 +84,19 @@ def draw(pairs: list[Pair], labels: tuple[str, str], path: Path) -> None:
     from matplotlib.ticker import LogLocator, NullFormatter
 
     scenes = list(dict.fromkeys(pair.after.scene for pair in pairs))
-    kinds = list(dict.fromkeys((pair.after.method, pair.after.preset) for pair in pairs))
+    kinds = list(dict.fromkeys(pair.after.label for pair in pairs))
     rows = -(-len(scenes) // COLUMNS)
     figure = Figure(figsize=(3.4 * min(COLUMNS, len(scenes)), 2.7 * rows + 0.5), layout="constrained")
     handles = {}
     for place, scene in enumerate(scenes):
         axes = figure.add_subplot(rows, min(COLUMNS, len(scenes)), place + 1)
         for pair in (each for each in pairs if each.after.scene == scene):
-            kind = (pair.after.method, pair.after.preset)
+            kind = pair.after.label
             color = colormaps["tab10"](kinds.index(kind) % 10)
             for curve, label, line in zip((pair.before, pair.after), labels, _LINES, strict=True):
                 points = [(look.cpu_seconds, look.psnr) for look in curve.looks]
                 (drawn,) = axes.plot(*zip(*points), line, color=color, marker=".", markersize=4)
-                handles[f"{', '.join(kind)}: {label}"] = drawn
+                handles[f"{kind}: {label}"] = drawn
         axes.set_title(scene, fontsize="medium")
         axes.set(xscale="log")
         axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))

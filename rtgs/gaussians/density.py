@@ -81,10 +81,25 @@ def split_gaussians(gaussians: Kind, count: int, shrink: float, generator: torch
     return children
 
 
+@dataclass(frozen=True)
+class Beyond:
+    """What is far away, and may be as large as it is far."""
+
+    center: Tensor  # (3,) world
+    distance: float  # world units
+
+    def holds(self, means: Tensor) -> Tensor:
+        """(N,) bool: which of the (N, 3) means are that far from the centre."""
+        return (means - self.center).norm(dim=1) > self.distance
+
+
 class DensityControl:
     """Statistics of the steps since the last change of N, and the rules that use them.
 
     A Gaussian is visible in a step if its weight sum is positive or its signal is not zero; means are over those steps.
+
+    Attributes:
+        beyond: Gaussians there are never too large; None: nothing is spared.
     """
 
     needs_signal = True  # of every training view
@@ -105,6 +120,7 @@ class DensityControl:
             raise ValueError("density.split_shrink and density.too_large_shrink must be positive")
         self.settings = settings
         self.extent = extent
+        self.beyond: Beyond | None = None
         self._clear(0)
 
     def _clear(self, count: int) -> None:  # 0: as many as the next step observes
@@ -177,6 +193,8 @@ class DensityControl:
         too_large = torch.zeros_like(transparent)
         if s.too_large > 0 and (after_reset or not s.too_large_after_reset):
             too_large = ~transparent & (size > s.too_large * self.extent)
+            if self.beyond is not None:
+                too_large &= ~self.beyond.holds(gaussians.means.detach())
         too_large_pruned = too_large if s.too_large_pruned else too_large & self._lowest_weights(s.low_weight_share)
         too_large_split = too_large & ~too_large_pruned
         rest = high_signal & ~transparent & ~too_large

@@ -142,8 +142,8 @@ class DensitySettings:
     # The cap is at most this times the pixels of the largest training view (more cannot be told apart, and fit noise);
     # None: no such bound, as published.
     max_per_pixel: float | None = None
-    # The cap is at most this times the points of the scene from which the Gaussians start: where photos agree on few,
-    # more Gaussians fit each photo for itself (docs/lab/training.md). None: no such bound, as published.
+    # The cap is at most this times the points of the scene, where they are no random ones and the base set starts from
+    # them: where photos agree on few, more Gaussians fit each photo for itself (docs/lab/training.md). None: no bound.
     max_per_point: float | None = field(default=None, metadata=UNLESS_DEFAULT)
     cap_share: float = 0.9  # above this share of max_surfels (the cap) the lowest mean weights go
     # Share of the cap that one call may add beyond it, highest signals first, before the lowest weights go. None: any
@@ -166,7 +166,7 @@ class DensitySettings:
         for name in ("max_per_pixel", "max_per_point"):
             share = getattr(self, name)
             if share is not None:
-                refuse_unless(share > 0, f"density.{name}", share, "above 0, or null")
+                refuse_unless(0 < share < math.inf, f"density.{name}", share, "above 0 and finite, or null")
 
 
 @dataclass(frozen=True)

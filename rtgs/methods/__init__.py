@@ -72,7 +72,8 @@ def create_method(
     if object_mesh is not None and spec.object_stage(settings) is None:
         raise ValueError(f"method {spec.name} has no stage that takes an object mesh, or it is switched off")
     pixels = max((view.camera.width * view.camera.height for view in scene.train), default=0)
-    counts = SceneCounts(pixels, len(scene.points) if settings.init.random_points == 0 else None)
+    drawn = scene.random_points or settings.init.random_points > 0
+    counts = SceneCounts(pixels, None if drawn else len(scene.points))
     settings, lowered = bound_counts(settings.in_scene(glass=object_mesh is not None), counts)
     decisions = (*lowered, *spec.unread_losses(settings))
     stages = spec.timeline(settings, schedule, transparent=object_mesh is not None)

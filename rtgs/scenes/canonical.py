@@ -72,6 +72,7 @@ def save_scene(scene: Scene, folder: Path) -> None:
         "extent": scene.extent,
         "source": scene.source,
         **({} if scene.noise_psnr is None else {"noise_psnr": scene.noise_psnr}),
+        **({"random_points": True} if scene.random_points else {}),
         **entries,
     }
     (folder / SCENE_FILE).write_text(json.dumps(content, indent=1), encoding="utf-8")
@@ -105,6 +106,7 @@ def read_scene(folder: Path) -> Scene:
             source=content["source"],
             held=_views(folder, content.get("held", ())),
             noise_psnr=content.get("noise_psnr"),
+            random_points=content.get("random_points", False) is True,
         )
     except CaptureError:
         raise

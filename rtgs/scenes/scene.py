@@ -59,6 +59,7 @@ class Scene:
     source: str  # where it came from: format, split rule, origin of the points
     held: tuple[View, ...] = ()  # kept from training and testing alike: methods are compared on them
     noise_psnr: float | None = None  # dB of the test photos against noise-free ones, mean; where that is known
+    random_points: bool = False  # the points are drawn at random: no photo agrees on them
 
     @property
     def has_masks(self) -> bool:
@@ -147,7 +148,7 @@ def load_scene(settings: SceneSettings) -> Scene:
     except CaptureError as error:
         raise CaptureError(f"capture {capture.root}: {error}") from error
     used = [by_name[name] for name in (*sorted(inner), *split.test)]
-    points, point_source = _scene_points(capture, settings, used, extent)
+    points, point_source, at_random = _scene_points(capture, settings, used, extent)
     record = CaptureRecord.read(capture.root)
     scene = Scene(
         name=record.labelled(settings.name) if record else settings.name,
@@ -157,6 +158,7 @@ def load_scene(settings: SceneSettings) -> Scene:
         point_colors=torch.from_numpy(points.colors.astype(np.float32)),
         extent=extent,
         held=tuple(load_view(by_name[name], settings) for name in split.held),
+        random_points=at_random,
         noise_psnr=None if record is None else _noise_psnr(record, [by_name[name] for name in split.test], settings),
         source=f"{capture.format}; test views: {split.rule}; points: {point_source}{record.origin if record else ''}",
     )
@@ -175,21 +177,23 @@ def _noise_psnr(record: CaptureRecord, tests: list[CaptureView], settings: Scene
 
 def _scene_points(
     capture: Capture, settings: SceneSettings, views: list[CaptureView], extent: float
-) -> tuple[PointCloud, str]:
-    """The points surfels start from, filtered, and a line on their origin."""
+) -> tuple[PointCloud, str, bool]:
+    """The points surfels start from, filtered, a line on their origin, and whether they are random."""
     centers = np.array([view.center for view in views])
-    if settings.points == "random" or capture.points is None:
+    at_random = settings.points == "random" or capture.points is None
+    if at_random:
         axes = np.array([view.rotation[2] for view in views])
         points = random_points(capture, centers, axes, settings)
         origin = points.source
     else:
+        assert capture.points is not None
         points = capture.points
         origin = capture.format
     result = filter_points(points, centers, extent, settings.near_camera, settings.far_factor)
     problem = too_few_points(len(result.points), len(points), points.source, settings.min_points)
     if problem:
         raise CaptureError(f"capture {capture.root}: {problem}")
-    return result.points, f"{origin}, {result.summary}"
+    return result.points, f"{origin}, {result.summary}", at_random
 
 
 def load_view(view: CaptureView, settings: SceneSettings, *, with_truth: bool = False) -> View:

@@ -22,7 +22,7 @@ from lab.late_levers import (
     votes,
     weights_on,
 )
-from lab.late_training import SHELL_POINTS, Session
+from lab.late_training import Session
 from rtgs.methods.model import Model
 from rtgs.train.method import Mode
 
@@ -194,22 +194,15 @@ def test_the_background_is_another_in_every_step_and_its_own_afterwards(session,
         late_training, "judge", lambda method, *rest: (judged.append(method.base._background), judge(method, *rest))[1]
     )
     score = session.background()
-    assert len({tuple(color.tolist()) for color in colors}) == session.total
+    assert len({tuple(color.tolist()) for color in colors}) == session.total + 1
     assert torch.equal(judged[0], session.create().base._background)
     assert 5 < score.psnr < 40
 
 
-def test_the_shell_is_there_from_the_start(session, monkeypatch) -> None:
-    monkeypatch.setattr(Session, "trainer", lambda *rest: _Idle())
-    score = session.shell()
-    assert score.gaussians == len(session.create().base.set) + SHELL_POINTS
-    assert score.cpu_seconds == 0
-
-
-class _Idle:
-    """Trains nothing."""
-
-    cpu_seconds = 0.0
-
-    def run(self) -> _Idle:
-        return self
+def test_the_drawn_background_is_what_is_seen(session) -> None:
+    model, view, random = session.create(), session.unseen.train[0], RandomBackground(0)
+    images = []
+    for step in range(2):
+        random.look(model, step)
+        images.append(model.render(view.camera, 1, Mode.EVALUATE).image)
+    assert (images[0] - images[1]).abs().max() > 0.05

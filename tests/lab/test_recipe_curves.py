@@ -1,5 +1,6 @@
 """Two recipes' curves: read from tables, paired, drawn, and when the second has caught up."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -45,6 +46,14 @@ def test_when_the_second_has_caught_up(after: tuple[tuple[float, float], ...], s
     pair = Pair(curve((1.0, 15.0), (4.0, 20.0)), curve(*after))
     assert pair.caught_up == seconds
     assert pair.row().endswith("| never |" if seconds is None else f"| {seconds:.0f} |")
+
+
+def test_a_row_names_the_seed():
+    first = curve((1.0, 15.0))
+    second = replace(first, seed=2)
+    rows = [pair.row() for pair in paired([first, second], [first, second])]
+    assert "2dgs, quick |" in rows[0]
+    assert "2dgs, quick, seed 2 |" in rows[1]
 
 
 def test_the_picture_has_a_plot_for_each_scene(tmp_path: Path):

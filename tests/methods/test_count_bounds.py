@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -34,8 +35,10 @@ def test_only_the_scenes_own_points_count():
     drawn = replace(settings, init=replace(settings.init, random_points=30))
     own, random = (small_trainer(settings=each, schedule=schedule) for each in (settings, drawn))
     cap = f"cap of {2 * len(own.scene.points):,} instead of 1,000,000 (density)"
+    scattered = small_trainer(replace(own.scene, random_points=True), settings, schedule)
     assert cap in [decision.what for decision in own.run().decisions]
-    assert not any(decision.what.startswith("cap of") for decision in random.run().decisions)
+    for each in (random, scattered):
+        assert not any(decision.what.startswith("cap of") for decision in each.run().decisions)
 
 
 def test_each_set_has_its_own_bound_and_what_is_lowered_is_told():
@@ -68,8 +71,8 @@ def test_training_keeps_to_the_bound():
     assert any(decision.what.startswith("cap of") for decision in summary.decisions)
 
 
-@pytest.mark.parametrize("share", [0.0, -1.0])
+@pytest.mark.parametrize("share", [0.0, -1.0, math.inf])
 @pytest.mark.parametrize("key", ["max_per_pixel", "max_per_point"])
 def test_a_bound_that_leaves_nothing_is_refused(key, share):
-    with pytest.raises(ValueError, match=f"density.{key}={share:g}.*above 0"):
+    with pytest.raises(ValueError, match=f"density.{key}={share}.*above 0"):
         DensitySettings(**{key: share})

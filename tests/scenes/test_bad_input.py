@@ -149,7 +149,9 @@ def test_one_single_training_view(tmp_path):
 def test_point_cloud_of_three_points(tmp_path):
     root = ColmapCapture(tmp_path, points=3).write()
     refused(root, "only 3 usable points of 3 in .*points3D.bin", "at least 10 are needed", "set scene.points=random")
-    assert len(load_scene(SceneSettings(path=str(root), points="random", random_points=500)).points) > 400
+    drawn = load_scene(SceneSettings(path=str(root), points="random", random_points=500))
+    assert len(drawn.points) > 400
+    assert drawn.random_points
 
 
 def test_no_points_at_all(tmp_path):

@@ -52,6 +52,13 @@ def test_round_trip_is_exact(root, tmp_path):
     assert str(back.summary()) == str(scene.summary())
     assert back.has_masks
     assert back.has_normals
+    assert not back.random_points
+
+
+def test_a_round_trip_keeps_that_points_are_random(root, tmp_path):
+    scene = load_scene(SceneSettings(name="ring", path=str(root), points="random", random_points=500, long_side=37))
+    save_scene(scene, tmp_path / "artifact")
+    assert read_scene(tmp_path / "artifact").random_points
 
 
 def test_held_out_views_are_kept_and_change_nothing_else(root, tmp_path):

@@ -14,10 +14,10 @@ from rtgs.core.decisions import Decision
 from rtgs.gaussians.initialize import gaussians_from_points
 from rtgs.gaussians.normals import NORMAL_RESIDUAL
 from rtgs.gaussians.primitives import Gaussians
-from rtgs.gaussians.settings import DensitySettings, InitSettings, McmcSettings
-from rtgs.gaussians.shell import far_shell
+from rtgs.gaussians.settings import DensitySettings, McmcSettings
 from rtgs.gaussians.smoothing import REFRESH_EVERY, Smoothing
 from rtgs.gaussians.surfels import ActivatedGaussians
+from rtgs.methods.parts.far_shell import Shell
 from rtgs.methods.parts.gaussian_set import GaussianSet, densified, opacity_reset
 from rtgs.methods.parts.kinds import GaussianKind, RasterRequest
 from rtgs.methods.parts.part import Frame, Part, Raster, Rows
@@ -37,7 +37,6 @@ from rtgs.train.settings import ScheduleSettings
 
 if TYPE_CHECKING:
     from rtgs.methods.spec import Setup
-    from rtgs.scenes.scene import Scene
 
 
 class BaseRules(Protocol):
@@ -91,18 +90,26 @@ class BaseSet(Part):
         self.bend: Callable[[Frame, ActivatedGaussians], Tensor] | None = None
         self.mcmc = mcmc_of(settings.density)
         init = settings.init
+        shell = None if init.shell_points == 0 else Shell.of(init, scene)
         if self.mcmc is not None:
             init = replace(init, opacity=self.mcmc.init_opacity, scale=self.mcmc.init_scale)
         self.set = GaussianSet(
             self.name,
             gaussians_from_points(
-                kind.type, scene.points, scene.point_colors, init, setup.generator, more=_shell(init, scene)
+                kind.type,
+                scene.points,
+                scene.point_colors,
+                init,
+                setup.generator,
+                more=None if shell is None else (shell.points, shell.colors),
             ),
             optimizer=settings.optimizer,
             density=settings.density,
             means_lr_steps=setup.schedule.means_lr_steps,
             extent=scene.extent,
         )
+        if shell is not None:
+            self.set.density.beyond = shell.beyond
         if settings.render.smoothing > 0:
             cameras = [view.camera for view in scene.train]
             near = settings.render.near * scene.extent
@@ -242,16 +249,6 @@ def mcmc_of(density: DensitySettings) -> McmcSettings | None:
 def composited(gaussians: Gaussians, colors: Tensor) -> Tensor:
     """(N, C) what is composited of a set: SH colours (N, 3), then every channel as it is activated, in its order."""
     return named_features(gaussians, colors)[1] if gaussians.channels else colors
-
-
-def _shell(init: InitSettings, scene: Scene) -> tuple[Tensor, Tensor] | None:
-    """Points and colours of the far shell."""
-    if init.shell_points == 0:
-        return None
-    centers = torch.stack([view.camera.center for view in scene.train])
-    color = torch.stack([view.image.mean((1, 2)) for view in scene.train]).mean(0)
-    points = far_shell(init.shell_points, init.shell_distance, centers, scene.extent)
-    return points, color.expand(len(points), 3)
 
 
 def _joined(base: Rows, appended: Sequence[Rows]) -> tuple[ActivatedGaussians, Tensor]:
