@@ -32,7 +32,11 @@ CASES = [(scene, method) for scene in ("ball_statue", "toycar") for method in ("
 # What the presets and rtgs have become since.
 OLD_STARTS = ("method.reflection.start_before_glass=null", "method.transmittance.start=0.5")
 SHORT = ("preset=quick", "schedule.total=300", *OLD_STARTS)
-OLD_RATES = ("method.optimizer.decay_from=1.0", "method.init.orientation=published")
+OLD_RATES = (
+    "method.optimizer.decay_from=1.0",
+    "method.init.orientation=published",
+    "method.density.max_per_point=null",
+)
 OLD_GLASS = ("ablation=learned_glass", "mesh.object.surface.fit=carved")
 
 
