@@ -13,6 +13,7 @@ from torch.autograd.function import once_differentiable
 from rtgs.gaussians.primitives import PARAMETERS, Gaussians
 from rtgs.gaussians.surfels import ActivatedGaussians
 from rtgs.native import core
+from rtgs.native.threads import threads
 
 
 def activate_gaussians(gaussians: Gaussians, camera_center: Tensor, sh_degree: int) -> ActivatedGaussians:
@@ -82,7 +83,7 @@ class _Activate(torch.autograd.Function):
             degree,
             arrays(outputs),
             None if saved is None else saved.numpy(),
-            torch.get_num_threads(),
+            threads(),
         )
         if saved is not None:
             ctx.save_for_backward(*raw, outputs[2], saved)
@@ -101,7 +102,7 @@ class _Activate(torch.autograd.Function):
             *arrays((scales, saved)),
             arrays(upstream),
             arrays(gradients),
-            torch.get_num_threads(),
+            threads(),
         )
         by_center = None
         if ctx.needs_input_grad[0]:  # the means that pass here are read for the direction from the centre alone

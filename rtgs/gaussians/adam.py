@@ -15,6 +15,7 @@ from rtgs.gaussians.harmonics import rest_count
 from rtgs.gaussians.primitives import PARAMETERS, Gaussians
 from rtgs.gaussians.settings import OptimizerSettings
 from rtgs.native import core
+from rtgs.native.threads import threads
 
 REPORTED_ROWS = 8
 
@@ -50,7 +51,7 @@ def find_nonfinite(tensors: Iterable[tuple[str, Tensor | None]]) -> tuple[NonFin
         if tensor is None:
             continue
         values = tensor.detach().contiguous().numpy()
-        count = core.count_nonfinite(values, torch.get_num_threads())
+        count = core.count_nonfinite(values, threads())
         if count:
             rows = np.flatnonzero(~np.isfinite(values.reshape(len(values) if values.ndim else 1, -1)).all(axis=1))
             found.append(NonFinite(name, count, tuple(rows[:REPORTED_ROWS].tolist())))
@@ -91,7 +92,7 @@ def move(moving: Sequence[Moving], updates: int, betas: tuple[float, float], eps
         entries.append((*(t.numpy() for t in tensors), each.active, float(each.rate / (1 - betas[0] ** updates))))
         increment_version(each.values)  # a graph that still needs the old values refuses its backward pass
     second_scale = 1 / math.sqrt(1 - betas[1] ** updates)
-    if core.adam_step(entries, *betas, eps, second_scale, torch.get_num_threads()):
+    if core.adam_step(entries, *betas, eps, second_scale, threads()):
         raise NonFiniteGradientError(find_nonfinite((each.name, each.values.grad) for each in moving), step_index)
 
 

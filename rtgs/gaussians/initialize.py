@@ -17,6 +17,7 @@ from rtgs.gaussians.harmonics import rest_count, rgb_to_sh_dc
 from rtgs.gaussians.primitives import Gaussians
 from rtgs.gaussians.settings import InitSettings
 from rtgs.gaussians.surfels import Surfels
+from rtgs.native.threads import threads
 
 SMALLEST_SQUARED_DISTANCE = 1e-7  # world units squared: the scale of duplicate points
 BOX_QUANTILES = (0.005, 0.995)  # per axis: the scene box without far outliers (method.md 6.1)
@@ -135,7 +136,7 @@ def surface_orientations(points: Tensor, neighbors: int = 10) -> Tensor:
     if count < 1:
         return torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(points), 1)
     coordinates = points.double().numpy()
-    _, near = KDTree(coordinates).query(coordinates, k=count + 1, workers=torch.get_num_threads())
+    _, near = KDTree(coordinates).query(coordinates, k=count + 1, workers=threads())
     around = coordinates[near] - coordinates[near].mean(axis=1, keepdims=True)
     _, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))  # columns, by ascending eigenvalue
     normal, longest = axes[:, :, 0], axes[:, :, 2]
@@ -155,7 +156,7 @@ def neighbor_distance(points: Tensor, neighbors: int) -> Tensor:
     if count < 1:
         return torch.full((len(points),), math.sqrt(SMALLEST_SQUARED_DISTANCE))
     coordinates = points.double().numpy()
-    distance, _ = KDTree(coordinates).query(coordinates, k=count + 1, workers=torch.get_num_threads())
+    distance, _ = KDTree(coordinates).query(coordinates, k=count + 1, workers=threads())
     squared = np.square(distance[:, 1:]).mean(axis=1)  # column 0 is the point itself (or its duplicate, also at 0)
     return torch.from_numpy(np.sqrt(np.maximum(squared, SMALLEST_SQUARED_DISTANCE))).float()
 

@@ -18,6 +18,7 @@ from torch.nn.functional import linear, normalize, pad
 
 from rtgs.light.feature_map import level_sides, map_lookup
 from rtgs.native import core
+from rtgs.native.threads import threads
 
 BRIGHTEST = 5.0  # log of the largest light
 DIRECTION, SURFACE = 16, 4  # features of a direction, and of a surface
@@ -89,7 +90,7 @@ class _Light(torch.autograd.Function):
         out = (found.numpy(), places.numpy(), color.numpy())
         scratch = torch.empty(core.feature_scratch(width)).numpy()
         map_ = (pyramid.numpy(), _numbers(sides))
-        core.feature_light(*map_, _arrays(packed), *rays, scratch, *out, torch.get_num_threads())
+        core.feature_light(*map_, _arrays(packed), *rays, scratch, *out, threads())
         ctx.save_for_backward(pyramid, directions, level, surface, found, places, *packed)
         ctx.sides, ctx.width = sides, len(network[0])
         return color
@@ -106,7 +107,7 @@ class _Light(torch.autograd.Function):
         saved = (scratch, found.numpy(), places.numpy(), upstream[0].contiguous().numpy())
         map_ = (pyramid.numpy(), _numbers(ctx.sides))
         given = (_arrays(packed), *_arrays(rays), *saved, _arrays(to))
-        core.feature_light_backward(*map_, *given, torch.get_num_threads())
+        core.feature_light_backward(*map_, *given, threads())
         return (None, *to[:4], *_unpacked(whole[0], ctx.width, width))
 
 

@@ -16,6 +16,7 @@ from torch.autograd.function import once_differentiable
 
 from rtgs.light.faces import FACES, border
 from rtgs.native import core
+from rtgs.native.threads import threads
 
 SHORTEST = 1e-18  # a direction without a larger component has none: it meets face 0's middle, and learns nothing
 
@@ -118,8 +119,8 @@ class _Lookup(torch.autograd.Function):
         directions = directions.detach().contiguous()
         level = torch.empty(0) if level is None else level.detach().contiguous()
         color = torch.empty(len(directions), 3)
-        threads = torch.get_num_threads()
-        core.cube_lookup(padded.numpy(), _numbers(sides), directions.numpy(), level.numpy(), color.numpy(), threads)
+        given = (padded.numpy(), _numbers(sides), directions.numpy(), level.numpy())
+        core.cube_lookup(*given, color.numpy(), threads())
         ctx.save_for_backward(padded, directions, level)
         ctx.sides = sides
         return color
@@ -132,7 +133,7 @@ class _Lookup(torch.autograd.Function):
         to_padded, to_directions, to_level = outputs
         given = (directions.numpy(), level.numpy(), upstream[0].contiguous().numpy())
         found = (each.numpy() for each in outputs)
-        core.cube_lookup_backward(padded.numpy(), _numbers(ctx.sides), *given, *found, torch.get_num_threads())
+        core.cube_lookup_backward(padded.numpy(), _numbers(ctx.sides), *given, *found, threads())
         to_texels = None
         if ctx.needs_input_grad[0]:
             to_texels = torch.empty(texel_count(ctx.sides), 3)

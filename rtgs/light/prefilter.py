@@ -22,6 +22,7 @@ from torch.autograd.function import once_differentiable
 
 from rtgs.light.faces import FACES, mirror_images, texel_areas, texel_directions
 from rtgs.native import core
+from rtgs.native.threads import threads
 
 SHARPEST, KNEE = 0.08, 0.5  # roughness of the first and of the last but one level (NVDIFFREC)
 CONE_SHARE = 0.99  # of D, summed over equal steps of the angle: what is beyond counts as 0 (NVDIFFREC)
@@ -183,7 +184,7 @@ class _Filtered(torch.autograd.Function):
 def _apply(values: Tensor, level: Filter, *, backward: bool) -> Tensor:
     found, given = torch.empty(len(values), 3), values.contiguous().numpy()
     work = _work(len(values))
-    core.cube_filter(*level.arrays(backward), given, work, found.numpy(), torch.get_num_threads())
+    core.cube_filter(*level.arrays(backward), given, work, found.numpy(), threads())
     return found
 
 

@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from rtgs.native import core
+from rtgs.native.threads import threads
 
 _DARK_COLOR, _DARK_LIGHT = 0.04045, 0.0031308  # below, both ways are a line of this slope
 _SLOPE, _OFFSET, _POWER = 12.92, 0.055, 2.4
@@ -51,7 +52,7 @@ def encoded_twin(light: Tensor) -> Tensor:
 def _filled(kernel: str, *given: Tensor) -> Tensor:
     """What a native kernel makes of contiguous numbers: as many, of the same shape."""
     result = torch.empty(given[0].shape, dtype=torch.float32)
-    getattr(core, kernel)(*(each.numpy() for each in given), result.numpy(), torch.get_num_threads())
+    getattr(core, kernel)(*(each.numpy() for each in given), result.numpy(), threads())
     return result
 
 

@@ -7,6 +7,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from rtgs.native import core
+from rtgs.native.threads import threads
 from rtgs.optics.microfacet import specular_weights
 from rtgs.optics.settings import OpticsSettings
 
@@ -41,7 +42,7 @@ class _Reflection(torch.autograd.Function):
     def forward(ctx, cosine: Tensor, roughness: Tensor, f0: Tensor, numbers: tuple[float, float, float]) -> Tensor:
         maps = [m.detach().contiguous() for m in (cosine, roughness, f0)]
         weight = torch.empty_like(maps[0])
-        core.microfacet_reflection(*(m.numpy() for m in maps), *numbers, weight.numpy(), torch.get_num_threads())
+        core.microfacet_reflection(*(m.numpy() for m in maps), *numbers, weight.numpy(), threads())
         ctx.save_for_backward(*maps)
         ctx.numbers = numbers
         return weight
@@ -52,5 +53,5 @@ class _Reflection(torch.autograd.Function):
         maps = [m.numpy() for m in ctx.saved_tensors]
         gradients = [torch.empty_like(m) for m in ctx.saved_tensors]
         arrays = (upstream.contiguous().numpy(), *(g.numpy() for g in gradients))
-        core.microfacet_reflection_backward(*maps, *ctx.numbers, *arrays, torch.get_num_threads())
+        core.microfacet_reflection_backward(*maps, *ctx.numbers, *arrays, threads())
         return (*gradients, None)

@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from rtgs.native import core
+from rtgs.native.threads import threads
 
 SIDE = 48  # cells of the table along cosine and width
 SAMPLES = 512  # directions of one entry
@@ -63,7 +64,7 @@ class _Weight(torch.autograd.Function):
     def forward(ctx, *given: Tensor):
         maps = [each.detach().contiguous() for each in given]
         weight = torch.empty_like(maps[2])
-        core.lobe_weight(*_lobes(maps), weight.numpy(), torch.get_num_threads())
+        core.lobe_weight(*_lobes(maps), weight.numpy(), threads())
         ctx.save_for_backward(*maps)
         return weight
 
@@ -73,7 +74,7 @@ class _Weight(torch.autograd.Function):
         maps = ctx.saved_tensors
         gradients = tuple(torch.empty_like(each) for each in maps)
         arrays = (upstream[0].contiguous().numpy(), *(each.numpy() for each in gradients))
-        core.lobe_weight_backward(*_lobes(maps), *arrays, torch.get_num_threads())
+        core.lobe_weight_backward(*_lobes(maps), *arrays, threads())
         return gradients
 
 

@@ -11,6 +11,7 @@ from torch.autograd.function import once_differentiable
 
 from rtgs.core.cameras import Camera
 from rtgs.native import core
+from rtgs.native.threads import threads
 from rtgs.render.arguments import check_float32, check_shapes, check_size
 from rtgs.render.buffers import EllipsoidBuffers, EllipsoidOptions
 from rtgs.render.native_call import as_array, empty_if, native_camera
@@ -81,7 +82,7 @@ def rasterize_ellipsoids(
     check_size(camera)
     if background is not None:
         background = background.detach().contiguous()
-    call = _Call(camera, options, background, torch.get_num_threads())
+    call = _Call(camera, options, background, threads())
     outputs = _Rasterize.apply(
         means.contiguous(),
         tangent_u.contiguous(),

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from rtgs.native import core
+from rtgs.native.threads import threads
 from rtgs.render.arguments import check_float32, check_trace_shapes, check_tree_shapes
 from rtgs.render.buffers import TraceBuffers, TraceOptions
 
@@ -58,7 +59,7 @@ class SurfelTree:
             A shape, a dtype or the cutoff does not fit.
         """
         arrays = _tree_arrays(means, tangent_u, tangent_v, scales, opacities, alpha_cutoff)
-        self._native.build(*arrays, alpha_cutoff, torch.get_num_threads())
+        self._native.build(*arrays, alpha_cutoff, threads())
         self._alpha_cutoff = alpha_cutoff
         return self
 
@@ -97,7 +98,7 @@ class SurfelTree:
                 f"refit got {len(means)} surfels, the tree was built for {self.surfels}; build it again after surfels "
                 "are added or removed"
             )
-        self._native.refit(*arrays, alpha_cutoff, torch.get_num_threads())
+        self._native.refit(*arrays, alpha_cutoff, threads())
         self._alpha_cutoff = alpha_cutoff
         return self
 
@@ -193,7 +194,7 @@ def trace_surfels(
     def rows(tensor: Tensor | None) -> Tensor | None:
         return None if tensor is None else tensor.contiguous()
 
-    call = _Call(tree, options, torch.get_num_threads())
+    call = _Call(tree, options, threads())
     inputs = (*surfels.values(), features, sh_dc, sh_rest, origins, directions)
     return TraceBuffers(*_Trace.apply(*(rows(tensor) for tensor in inputs), probe, call))
 

@@ -16,6 +16,7 @@ from torch.autograd.function import once_differentiable
 
 from rtgs.core.cameras import Camera
 from rtgs.native import core
+from rtgs.native.threads import threads
 
 MIN_ALPHA = 1e-6  # at or below it a pixel has no surface: its expected depth is 0
 PERCENTILE_SAMPLES = 16_384  # depth percentiles are taken over about this many pixels of a regular grid
@@ -45,7 +46,7 @@ def photometric_loss(image: Tensor, target: Tensor, l1: float = 0.8, dssim: floa
 def ssim(image: Tensor, target: Tensor) -> Tensor:
     """Mean SSIM (scalar tensor, no gradient) of two pictures (C, H, W) float32, range 0..1, as in method.md 9."""
     _check_pair(image, target)
-    _, dissimilarity = core.photometric_loss(_data(image), _data(target), 0.0, 1.0, True, None, None, _threads())
+    _, dissimilarity = core.photometric_loss(_data(image), _data(target), 0.0, 1.0, True, None, None, threads())
     return torch.tensor(1.0 - dissimilarity)
 
 
@@ -53,7 +54,7 @@ def ssim_map(image: Tensor, target: Tensor) -> Tensor:
     """(C, H, W) SSIM of every pixel and channel (no gradient); its mean is :func:`ssim`."""
     _check_pair(image, target)
     dissimilarity = torch.empty_like(image, memory_format=torch.contiguous_format, requires_grad=False)
-    core.photometric_loss(_data(image), _data(target), 0.0, 1.0, True, None, dissimilarity, _threads())
+    core.photometric_loss(_data(image), _data(target), 0.0, 1.0, True, None, dissimilarity, threads())
     return 1.0 - dissimilarity
 
 
@@ -161,7 +162,7 @@ class _Photometric(torch.autograd.Function):
     def forward(ctx, image: Tensor, target: Tensor, l1: float, dssim: float):
         gradient = _gradient_like(image) if ctx.needs_input_grad[0] else None
         l1_value, dssim_value = core.photometric_loss(
-            _data(image), _data(target), l1, dssim, dssim != 0, gradient, None, _threads()
+            _data(image), _data(target), l1, dssim, dssim != 0, gradient, None, threads()
         )
         if gradient is not None:
             ctx.save_for_backward(gradient)
@@ -182,7 +183,7 @@ class _NormalConsistency(torch.autograd.Function):
             ctx.save_for_backward(*gradients)
         maps = (_data(normal), _data(surface), _data(alpha))
         value = core.normal_consistency_loss(
-            *maps, is_surface, rotation, intrinsics, near, inverse_range, *gradients, _threads()
+            *maps, is_surface, rotation, intrinsics, near, inverse_range, *gradients, threads()
         )
         return torch.tensor(value, dtype=torch.float32)
 
@@ -202,7 +203,7 @@ class _MonoNormal(torch.autograd.Function):
         gradient = _gradient_like(normal) if ctx.needs_input_grad[0] else None
         weight = None if weight is None else _data(weight)
         maps = (_data(normal), _data(mono_normal), weight)
-        value = core.mono_normal_loss(*maps, rotation, float(with_l1), gradient, _threads())
+        value = core.mono_normal_loss(*maps, rotation, float(with_l1), gradient, threads())
         if gradient is not None:
             ctx.save_for_backward(gradient)
         return torch.tensor(value, dtype=torch.float32)
@@ -223,10 +224,6 @@ def _gradient_like(value: Tensor) -> Tensor:
 
 def _data(value: Tensor) -> Tensor:
     return value.detach().contiguous()
-
-
-def _threads() -> int:
-    return torch.get_num_threads()
 
 
 def _rotation(camera: Camera) -> Tensor:

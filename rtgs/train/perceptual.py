@@ -2,16 +2,40 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
+from rtgs.native.threads import threaded_torch
 from rtgs.pretrained.lpips import SCALE, SHIFT, InputRange, Lpips
 from rtgs.pretrained.vgg import Vgg16Features
 from rtgs.pretrained.weights import find_weights
 from rtgs.train.networks import networks_of
 from rtgs.train.settings import LossSettings
+
+
+class _WithGradient(torch.autograd.Function):
+    """A distance and its gradient in the first picture at once, on all threads: a network is worth waking them."""
+
+    @staticmethod
+    def forward(ctx, image: Tensor, target: Tensor, distance: Callable[[Tensor, Tensor], Tensor]):
+        with threaded_torch():
+            if not ctx.needs_input_grad[0]:
+                return distance(image, target)
+            leaf = image.detach().requires_grad_()
+            with torch.enable_grad():
+                found = distance(leaf, target)
+            ctx.save_for_backward(*torch.autograd.grad(found, leaf))
+        return found.detach()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, *upstream: Tensor):
+        (gradient,) = ctx.saved_tensors
+        return upstream[0] * gradient, None, None
 
 
 class PerceptualLoss:
@@ -44,9 +68,12 @@ class PerceptualLoss:
             for size, crop in zip(image.shape[1:], (rows, columns), strict=True)
         )
         part = (slice(None), slice(top, top + rows), slice(left, left + columns))
+        return _WithGradient.apply(image[part], target[part], self._distance)  # type: ignore[return-value]
+
+    def _distance(self, image: Tensor, target: Tensor) -> Tensor:
         if self._settings.perceptual_form == "lpips":
-            return self.network(image[part], target[part], InputRange.ZERO_ONE)
-        return self._feature_distance(image[part], target[part])
+            return self.network(image, target, InputRange.ZERO_ONE)
+        return self._feature_distance(image, target)
 
     def _feature_distance(self, image: Tensor, target: Tensor) -> Tensor:
         """The paper's form: mean L1 distance of raw features, mean over the five blocks."""

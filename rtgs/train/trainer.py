@@ -15,6 +15,7 @@ import torch
 from rtgs.core.decisions import Decision
 from rtgs.core.version import VERSION
 from rtgs.native import core
+from rtgs.native.threads import SERIAL_PIXELS, serial_torch, threads
 from rtgs.scenes.scene import Scene
 from rtgs.train.checkpoint import (
     Checkpoint,
@@ -161,9 +162,11 @@ class Trainer:
             self._announce(resumed_from)
             if first == self.stage.from_step:
                 self._note(first, self.method.begin(self.stage))
-            while self._step < self.stage.until:
-                self._train_step()
-                self._between_steps()
+            largest = max(view.camera.width * view.camera.height for view in self.scene.train)
+            with serial_torch(largest <= SERIAL_PIXELS):
+                while self._step < self.stage.until:
+                    self._train_step()
+                    self._between_steps()
         finally:
             self._flush_metrics()
             self.progress.close()
@@ -344,7 +347,7 @@ class Trainer:
             step=self._step,
             settings_digest=digest(self._settings),
             scene_digest=self._scene_digest,
-            threads=torch.get_num_threads(),
+            threads=threads(),
             isa=core.isa(),
             versions=(("rtgs", VERSION), ("torch", torch.__version__), ("python", platform.python_version())),
             elapsed=elapsed.wall,

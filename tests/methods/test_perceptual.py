@@ -50,6 +50,14 @@ def test_a_crop_gets_the_gradient_and_the_rest_of_the_image_none(network: Lpips,
     assert float(loss(target, target, torch.Generator())) == pytest.approx(0, abs=1e-9)
 
 
+def test_the_gradient_is_that_of_the_network(network: Lpips):
+    (image, target), own = pair(), pair()[0].requires_grad_()
+    image.requires_grad_()
+    (2 * PerceptualLoss(LossSettings(perceptual_crop=64), network)(image, target, torch.Generator())).backward()
+    (2 * network(own, target, InputRange.ZERO_ONE)).backward()
+    torch.testing.assert_close(image.grad, own.grad)
+
+
 def test_raw_features_need_no_heads_of_lpips(network: Lpips, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(weights, "weight_folders", lambda: (tmp_path,))
     monkeypatch.setattr(vgg, "verify_weights", lambda file, path: None)  # a tiny one in the place of the published

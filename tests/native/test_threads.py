@@ -6,8 +6,10 @@ import sys
 
 import numpy as np
 import pytest
+import torch
 
 from rtgs.native import core
+from rtgs.native.threads import serial_torch, threaded_torch, threads
 from tests.render.native_scene import native_scene
 from tests.render.native_trace_scene import native_trace_scene
 
@@ -113,9 +115,9 @@ CALLS = {
 
 @pytest.mark.parametrize("call", CALLS.values(), ids=CALLS.keys())
 def test_every_entry_refuses_numbers_of_threads_that_are_none(call):
-    for threads in (0, -1, -(2**31), 1025, 100_000):
-        with pytest.raises(ValueError, match=rf"threads={threads} must be 1 to 1024"):
-            call(threads)
+    for count in (0, -1, -(2**31), 1025, 100_000):
+        with pytest.raises(ValueError, match=rf"threads={count} must be 1 to 1024"):
+            call(count)
     call(1)
     call(3)
 
@@ -123,6 +125,45 @@ def test_every_entry_refuses_numbers_of_threads_that_are_none(call):
 def test_percentiles_on_no_grid_are_refused():
     with pytest.raises(ValueError, match="step=0 must be at least 1"):
         core.depth_percentiles(_floats(8, 8), None, 0.5, 0)
+
+
+@pytest.fixture
+def three_threads():
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.usefixtures("three_threads")
+def test_kernels_keep_their_threads_where_torch_is_serial():
+    def found() -> tuple[int, int]:
+        return threads(), torch.get_num_threads()
+
+    assert found() == (3, 3)
+    with serial_torch(wanted=False):
+        assert found() == (3, 3)
+    with serial_torch():
+        assert found() == (3, 1)
+        with threaded_torch():
+            assert found() == (3, 3)
+        with serial_torch():
+            assert found() == (3, 1)
+        assert found() == (3, 1)
+    assert found() == (3, 3)
+    with pytest.raises(ZeroDivisionError), serial_torch():
+        1 / 0  # noqa: B018
+    assert found() == (3, 3)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
+@pytest.mark.usefixtures("three_threads")
+def test_kernels_of_a_forked_child_take_one_thread():
+    with serial_torch():
+        child = os.fork()
+        if child == 0:
+            os._exit(threads())
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 1
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")

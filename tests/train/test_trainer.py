@@ -12,6 +12,8 @@ import pytest
 import torch
 from training_cases import small_method, small_scene, small_schedule, small_trainer
 
+from rtgs.native.threads import threads
+from rtgs.train import trainer as trainer_module
 from rtgs.train.checkpoint import load_newest
 from rtgs.train.guard import TrainingDiverged
 from rtgs.train.progress import LineProgress, StepReport
@@ -70,6 +72,26 @@ def test_training_learns_and_tells():
     assert {"train/l1", "train/dssim", "train/psnr", "surfels/base"} <= first.keys()
     assert "train/normal" in memory.rows[-2][1]
     assert "test/psnr" in memory.rows[3][1]
+
+
+@pytest.mark.parametrize("small", [True, False])
+def test_torch_is_serial_while_it_trains_on_small_pictures_alone(small: bool, monkeypatch: pytest.MonkeyPatch):
+    found: list[tuple[int, int]] = []
+
+    class Counts:
+        def look(self, method: object, step: int) -> None:
+            found.append((threads(), torch.get_num_threads()))
+
+    monkeypatch.setattr(trainer_module, "SERIAL_PIXELS", 10**6 if small else 1)
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        trainer = small_trainer(schedule=small_schedule(2), observer=Counts())
+        trainer.run()
+        Counts().look(None, 2)
+    finally:
+        torch.set_num_threads(before)
+    assert found == [*[(3, 1 if small else 3)] * 2, (3, 3)]
 
 
 def test_equal_seeds_give_equal_surfels_and_others_do_not():

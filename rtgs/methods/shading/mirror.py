@@ -15,6 +15,7 @@ from torch.autograd.function import once_differentiable
 
 from rtgs.gaussians.settings import MaterialSettings
 from rtgs.native import core
+from rtgs.native.threads import threads
 from rtgs.optics.light import decoded, encoded
 from rtgs.optics.microfacet import SpecularWeights, specular_weights
 from rtgs.optics.reflection import reflection_weight
@@ -156,7 +157,7 @@ class _Mirror(torch.autograd.Function):
         count = len(depth)
         outputs = (torch.empty(count, 3), torch.empty(count, 3), torch.empty(count))
         arrays = [m.numpy() for m in maps]
-        core.mirror_rays(*arrays, *numbers, *(o.numpy() for o in outputs), torch.get_num_threads())
+        core.mirror_rays(*arrays, *numbers, *(o.numpy() for o in outputs), threads())
         ctx.save_for_backward(*maps)
         ctx.numbers = numbers
         return outputs
@@ -167,5 +168,5 @@ class _Mirror(torch.autograd.Function):
         maps = [m.numpy() for m in ctx.saved_tensors]
         normal, depth = (torch.empty_like(m) for m in ctx.saved_tensors[:2])
         given = (g.contiguous().numpy() for g in upstream)
-        core.mirror_rays_backward(*maps, *ctx.numbers, *given, normal.numpy(), depth.numpy(), torch.get_num_threads())
+        core.mirror_rays_backward(*maps, *ctx.numbers, *given, normal.numpy(), depth.numpy(), threads())
         return normal, depth, None, None

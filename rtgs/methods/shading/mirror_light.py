@@ -13,6 +13,7 @@ from rtgs.gaussians.harmonics import SH_C0, sh_basis
 from rtgs.gaussians.primitives import unit_or_zero
 from rtgs.gaussians.surfels import ActivatedGaussians
 from rtgs.native import core
+from rtgs.native.threads import threads
 
 REST = 15  # SH functions above degree 0
 
@@ -46,7 +47,7 @@ class _MirrorLight(torch.autograd.Function):
     def forward(ctx, center: tuple[float, float, float], *given: Tensor):
         rows = [each.detach().contiguous() for each in given]
         color = torch.empty_like(rows[0])
-        core.mirror_light(*_arrays(rows[:3]), center, *_arrays(rows[3:]), color.numpy(), torch.get_num_threads())
+        core.mirror_light(*_arrays(rows[:3]), center, *_arrays(rows[3:]), color.numpy(), threads())
         ctx.save_for_backward(*rows)
         ctx.center = center
         return color
@@ -57,7 +58,7 @@ class _MirrorLight(torch.autograd.Function):
         rows = ctx.saved_tensors
         gradients = tuple(torch.empty_like(each) for each in rows)
         given = (*_arrays(rows[:3]), ctx.center, *_arrays(rows[3:]), upstream[0].contiguous().numpy())
-        core.mirror_light_backward(*given, _arrays(gradients), torch.get_num_threads())
+        core.mirror_light_backward(*given, _arrays(gradients), threads())
         return None, *gradients
 
 

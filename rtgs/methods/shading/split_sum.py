@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from rtgs.native import core
+from rtgs.native.threads import threads
 from rtgs.optics.split_sum import split_sum_weight
 
 DIELECTRIC = 0.04  # F_0 of what is no metal
@@ -100,7 +101,7 @@ class _MeanMirror(torch.autograd.Function):
         ctx.save_for_backward(*maps)
         ctx.numbers = (unit, SMALLEST_ALPHA, SHORTEST)
         given = (*(each.numpy() for each in maps), *ctx.numbers)
-        core.mean_mirror(*given, directions.numpy(), cosine.numpy(), torch.get_num_threads())
+        core.mean_mirror(*given, directions.numpy(), cosine.numpy(), threads())
         return directions, cosine
 
     @staticmethod
@@ -109,5 +110,5 @@ class _MeanMirror(torch.autograd.Function):
         maps = ctx.saved_tensors
         to_normal, to_alpha = (torch.empty_like(each) for each in maps[:2])
         given = (*(each.numpy() for each in maps), *ctx.numbers, *(each.contiguous().numpy() for each in upstream))
-        core.mean_mirror_backward(*given, to_normal.numpy(), to_alpha.numpy(), torch.get_num_threads())
+        core.mean_mirror_backward(*given, to_normal.numpy(), to_alpha.numpy(), threads())
         return to_normal, to_alpha, None, None
