@@ -7,6 +7,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from rtgs.mesh.guide import MeshGuide
+from rtgs.mesh.silhouettes import silhouette
 from rtgs.mesh.triangles import TriangleMesh
 from tests.mesh.shapes import box, box_depths, camera_at, join, sphere, sphere_depths
 
@@ -144,6 +145,29 @@ def test_a_far_camera_hits_a_small_mesh_where_its_planes_are() -> None:
     hits = guide.intersect(origins, np.tile([0.0, 1.0, 0.0], (9, 1)))
     assert (hits.count == 2).all()
     np.testing.assert_allclose(hits.distance[:, :2], [[1e5 - 1.0123, 1e5 + 1.0123]] * 9, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("stride", [1, 2, 3])
+@pytest.mark.parametrize(
+    ("center", "target", "seen"),
+    [
+        ((3.0, 0.4, 0.8), (0.0, 0.0, 0.0), True),
+        ((2.0, 0.4, 0.8), (0.0, 0.9, 0.0), True),  # across the border of the picture
+        ((0.1, 0.7, 0.1), (0.0, 0.0, 0.0), True),  # in the mesh's box
+        ((0.0, 0.3, 1.2), (1.5, 0.2, 0.2), True),  # half of the box is behind the camera
+        ((3.0, 0.0, 0.5), (3.0, 4.0, 0.0), False),
+        ((3.0, 0.0, 0.5), (9.0, 0.1, 0.0), False),
+    ],
+)
+def test_a_silhouette_is_that_of_all_rays(center, target, seen: bool, stride: int) -> None:
+    guide = MeshGuide(join(sphere(0.5), box((0.4, 0.6, 0.7), (0.8, 0.8, 0.9))), 0.0)
+    camera = camera_at(center, target)
+    rays = camera.rays(torch.float32)
+    directions = rays.directions.numpy()
+    every = guide.meets(np.broadcast_to(rays.origin.numpy(), (48 * 64, 3)), directions.reshape(-1, 3)).reshape(48, 64)
+    expected = every[stride // 2 :: stride, stride // 2 :: stride]
+    assert bool(expected.any()) == seen
+    assert np.array_equal(silhouette(guide, camera, stride), expected)
 
 
 def test_bad_calls() -> None:
