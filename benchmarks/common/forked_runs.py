@@ -1,7 +1,7 @@
 """``rtgs run`` in forked children of one process that has imported everything: a start costs milliseconds, so that
 hundreds of runs can be killed.
 
-Only a process that computes nothing itself may fork: threads of OpenMP do not survive it. Children are told their
+Only a process that computes nothing itself may fork: threads do not survive it. Children are told their
 folder, write their output to ``log.txt`` in it, and end with the exit code of the command.
 """
 

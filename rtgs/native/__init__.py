@@ -13,7 +13,7 @@ except ImportError as error:
 
 
 def _in_forked_child() -> None:
-    """torch, like the core, would wait for ever for threads of OpenMP, which stay with the parent."""
+    """torch would wait for ever for its threads, which stay with the parent."""
     if (torch := sys.modules.get("torch")) is not None:
         torch.set_num_threads(1)
 

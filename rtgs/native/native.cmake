@@ -32,6 +32,7 @@ set(RTGS_BINDINGS
   bind/module.cpp
   common/isa.cpp
   common/memory.cpp
+  common/pool.cpp
   common/threads.cpp
   bind/image.cpp
   bind/activation.cpp
@@ -69,7 +70,7 @@ list(TRANSFORM RTGS_KERNELS PREPEND ${RTGS_NATIVE}/)
 list(TRANSFORM RTGS_BINDINGS PREPEND ${RTGS_NATIVE}/)
 target_sources(_core PRIVATE ${RTGS_BINDINGS})
 target_include_directories(_core PRIVATE ${RTGS_NATIVE})
-target_link_libraries(_core PRIVATE OpenMP::OpenMP_CXX)
+target_link_libraries(_core PRIVATE Threads::Threads)
 target_compile_options(_core PRIVATE ${RTGS_SANITIZERS})
 target_link_options(_core PRIVATE ${RTGS_SANITIZERS})
 if(RTGS_SANITIZE)
@@ -84,7 +85,6 @@ foreach(isa ${RTGS_ISAS})
   # fast-math when compiling only: linking with it would set flush-to-zero for the whole Python process.
   target_compile_options(${objects} PRIVATE ${RTGS_OPTIMIZE} -ffast-math -fno-finite-math-only -Wno-psabi
                          ${RTGS_FLAGS_${isa}} ${RTGS_SANITIZERS})
-  target_link_libraries(${objects} PRIVATE OpenMP::OpenMP_CXX)
   target_sources(_core PRIVATE $<TARGET_OBJECTS:${objects}>)
   target_compile_definitions(_core PRIVATE RTGS_HAS_${isa}=1)
 endforeach()

@@ -1,8 +1,10 @@
 """How many threads the core takes: what is refused, and what a forked child gets."""
 
+import hashlib
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -10,8 +12,8 @@ import torch
 
 from rtgs.native import core
 from rtgs.native.threads import serial_torch, threaded_torch, threads
-from tests.render.native_scene import native_scene
-from tests.render.native_trace_scene import native_trace_scene
+from tests.render.native_scene import SCENE_OPTIONS, native_scene
+from tests.render.native_trace_scene import everything, native_trace_scene
 
 
 def _floats(*shape: int) -> np.ndarray:
@@ -125,6 +127,28 @@ def test_every_entry_refuses_numbers_of_threads_that_are_none(call):
 def test_percentiles_on_no_grid_are_refused():
     with pytest.raises(ValueError, match="step=0 must be at least 1"):
         core.depth_percentiles(_floats(8, 8), None, 0.5, 0)
+
+
+def test_callers_at_once_and_more_parts_than_cores_give_the_same_bits():
+    scene = native_scene(count=500, width=70, height=50, channels=3)
+
+    def digest(count: int) -> str:
+        torch.set_num_threads(count)  # of this thread of Python
+        leaves = scene.leaves()
+        pixels = scene.render(SCENE_OPTIONS, leaves).features
+        found = [pixels.detach(), *torch.autograd.grad(pixels.square().sum(), leaves)]
+        found += everything(native_trace_scene(count=300, rays=500))
+        return hashlib.sha256(b"".join(each.detach().numpy().tobytes() for each in found)).hexdigest()
+
+    before = torch.get_num_threads()
+    try:
+        alone = digest(1)
+        with ThreadPoolExecutor(4) as executor:
+            found = set(executor.map(digest, [2, 3, 5, 16, 1024, 1, 7, 64] * 3))
+        assert found == {alone}
+        assert digest(1024) == alone
+    finally:
+        torch.set_num_threads(before)
 
 
 @pytest.fixture

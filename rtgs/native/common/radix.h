@@ -2,8 +2,7 @@
 #pragma once
 #include <cstring>
 
-#include <omp.h>
-
+#include "common/parallel.h"
 #include "raster/raster.h"
 
 namespace rtgs::RTGS_ISA {
@@ -27,26 +26,24 @@ static inline int clipped_threads(int threads, int64_t count) {
 // One stable pass over an 11-bit digit. histograms: (threads, kDigits).
 static inline void radix_pass(const DepthKey* in, DepthKey* out, int64_t count, int shift, int threads,
                               int64_t* histograms) {
-#pragma omp parallel num_threads(threads) if (threads > 1)
-  {
-    const int parts = omp_get_num_threads(), part = omp_get_thread_num();
-    const Chunk chunk = chunk_of(count, part, parts);
+  in_parts(threads, [&](int part) {
+    const Chunk chunk = chunk_of(count, part, threads);
     int64_t* mine = histograms + int64_t(part) * kDigits;
     memset(mine, 0, kDigits * sizeof(int64_t));
     for (int64_t k = chunk.begin; k < chunk.end; ++k) ++mine[in[k].depth >> shift & (kDigits - 1)];
-#pragma omp barrier
-#pragma omp single
-    {
-      int64_t start = 0;
-      for (int digit = 0; digit < kDigits; ++digit)
-        for (int p = 0; p < parts; ++p) {
-          int64_t size = histograms[int64_t(p) * kDigits + digit];
-          histograms[int64_t(p) * kDigits + digit] = start;
-          start += size;
-        }
+  });
+  int64_t start = 0;
+  for (int digit = 0; digit < kDigits; ++digit)
+    for (int part = 0; part < threads; ++part) {
+      int64_t size = histograms[int64_t(part) * kDigits + digit];
+      histograms[int64_t(part) * kDigits + digit] = start;
+      start += size;
     }
+  in_parts(threads, [&](int part) {
+    const Chunk chunk = chunk_of(count, part, threads);
+    int64_t* mine = histograms + int64_t(part) * kDigits;
     for (int64_t k = chunk.begin; k < chunk.end; ++k) out[mine[in[k].depth >> shift & (kDigits - 1)]++] = in[k];
-  }
+  });
 }
 
 // From spare into keys by ascending key; both hold count. scratch: kMaxThreads * kDigits numbers.

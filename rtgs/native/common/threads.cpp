@@ -8,13 +8,17 @@
 #endif
 
 #include "bind/bindings.h"
+#include "common/pool.h"
 
 namespace rtgs {
 namespace {
 
 std::atomic<bool> used_several{false}, left_behind{false};
 
-void in_forked_child() { left_behind = used_several.load(); }
+void in_forked_child() {
+  left_behind = used_several.load();
+  forget_pool();
+}
 
 }  // namespace
 

@@ -1,4 +1,5 @@
 // Activations of surfels and ellipsoids (Scales = 2, 3), one a lane. Every surfel is independent: the result is the same for any thread count.
+#include "common/parallel.h"
 #include "gaussians/activation.h"
 
 #include <cstring>
@@ -232,8 +233,7 @@ template <int Degree, int Scales>
 void forward(const ActivationShape& shape, const RawSurfels& in, const Activated& out, float* saved) {
   const long blocks = (shape.count + kLanes - 1) / kLanes;
   const int threads = useful_threads(shape);
-#pragma omp parallel for schedule(static) num_threads(threads) if (threads > 1)
-  for (long block = 0; block < blocks; ++block) {
+  each_in_shares(threads, blocks, [&](int64_t block) {
     const long i = block * kLanes;
     const RawSurfels from = rows_from(in, i, shape);
     const Activated to = rows_from(out, i, Scales);
@@ -244,7 +244,7 @@ void forward(const ActivationShape& shape, const RawSurfels& in, const Activated
     } else {
       activate_tail<Degree, Scales>(shape, from, to, keep, int(shape.count - i));
     }
-  }
+  });
 }
 
 template <int Degree, int Scales>
@@ -252,8 +252,7 @@ void backward(const ActivationShape& shape, const RawSurfels& in, const float* s
               const ActivatedGradients& up, const RawGradients& out) {
   const long blocks = (shape.count + kLanes - 1) / kLanes;
   const int threads = useful_threads(shape);
-#pragma omp parallel for schedule(static) num_threads(threads) if (threads > 1)
-  for (long block = 0; block < blocks; ++block) {
+  each_in_shares(threads, blocks, [&](int64_t block) {
     const long i = block * kLanes;
     const RawSurfels from = rows_from(in, i, shape);
     const ActivatedGradients g = rows_from(up, i, Scales);
@@ -265,7 +264,7 @@ void backward(const ActivationShape& shape, const RawSurfels& in, const float* s
     } else {
       backward_tail<Degree, Scales>(shape, from, scales + Scales * i, kept, g, to, int(shape.count - i));
     }
-  }
+  });
 }
 
 template <int Degree>

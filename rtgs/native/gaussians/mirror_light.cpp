@@ -1,4 +1,5 @@
 // SH light of each surfel along its own mirror direction (image/split_sum.h), one a lane.
+#include "common/parallel.h"
 #include "gaussians/harmonics.h"
 #include "image/split_sum.h"
 #include "image/vectors.h"
@@ -52,8 +53,7 @@ inline void store_row(float* rest, int64_t first, int lanes, const vfloat (&sh)[
 
 // Before the cut at 0.
 void mirror_light(const LightRows& in, float* color) {
-#pragma omp parallel for num_threads(in.threads) schedule(static) if (in.threads > 1)
-  for (int64_t first = 0; first < in.count; first += kLanes) {
+  each_block(in.threads, in.count, kLanes, [&](int64_t first) {
     const int lanes = lanes_at(first, in.count);
     const Mirrored at(in, first, lanes);
     vfloat basis[kFunctions], sh[row_registers<kRow>];
@@ -67,12 +67,11 @@ void mirror_light(const LightRows& in, float* color) {
       found.v[c] = sum;
     }
     store_vectors(color, first, lanes, found);
-  }
+  });
 }
 
 void mirror_light_backward(const LightRows& in, const float* upstream, const LightGradients& out) {
-#pragma omp parallel for num_threads(in.threads) schedule(static) if (in.threads > 1)
-  for (int64_t first = 0; first < in.count; first += kLanes) {
+  each_block(in.threads, in.count, kLanes, [&](int64_t first) {
     const int lanes = lanes_at(first, in.count);
     const Mirrored at(in, first, lanes);
     const Vector up = load_vectors(upstream, first, lanes);
@@ -101,7 +100,7 @@ void mirror_light_backward(const LightRows& in, const float* upstream, const Lig
     store_vectors(out.means, first, lanes, to_outward);
     store_vectors(out.tangent_u, first, lanes, cross(at.v, to_normal));
     store_vectors(out.tangent_v, first, lanes, cross(to_normal, at.u));
-  }
+  });
 }
 
 }  // namespace rtgs::RTGS_ISA

@@ -1,4 +1,5 @@
 // Kernels of mirror.h, kLanes pixels at a time. The last group goes through buffers of whole registers.
+#include "common/parallel.h"
 #include "image/mirror.h"
 
 #include "image/vectors.h"
@@ -30,8 +31,7 @@ struct Surface {  // of kLanes pixels
 }  // namespace
 
 void mirror_rays(const MirrorPixels& in, const MirrorRays& out) {
-#pragma omp parallel for num_threads(in.threads) schedule(static) if (in.threads > 1)
-  for (int64_t first = 0; first < in.count; first += kLanes) {
+  each_block(in.threads, in.count, kLanes, [&](int64_t first) {
     const int lanes = lanes_at(first, in.count);
     const Surface s(in, first, lanes);
     const vfloat depth = load_first(in.depth + first, lanes);
@@ -44,12 +44,11 @@ void mirror_rays(const MirrorPixels& in, const MirrorRays& out) {
     store_vectors(out.origins, first, lanes, origin);
     store_vectors(out.directions, first, lanes, direction);
     store_first(out.cosine + first, s.cosine, lanes);
-  }
+  });
 }
 
 void mirror_rays_backward(const MirrorPixels& in, const MirrorRays& upstream, const MirrorPixelGradients& out) {
-#pragma omp parallel for num_threads(in.threads) schedule(static) if (in.threads > 1)
-  for (int64_t first = 0; first < in.count; first += kLanes) {
+  each_block(in.threads, in.count, kLanes, [&](int64_t first) {
     const int lanes = lanes_at(first, in.count);
     const Surface s(in, first, lanes);
     const Vector to_origin = load_vectors(upstream.origins, first, lanes);
@@ -62,7 +61,7 @@ void mirror_rays_backward(const MirrorPixels& in, const MirrorRays& upstream, co
     for (int k = 0; k < 3; ++k)
       store_first(out.normal + k * in.count + first, s.inverse_normal * (to_normal.v[k] - along * s.normal.v[k]), lanes);
     store_first(out.depth + first, dot(to_origin, s.view), lanes);
-  }
+  });
 }
 
 namespace {
@@ -97,16 +96,14 @@ struct Microfacet {  // w_r = F / (1 / S + 1 / S_max) of kLanes pixels, and what
 }  // namespace
 
 void microfacet_reflection(const MicrofacetPixels& in, float* weight) {
-#pragma omp parallel for num_threads(in.threads) schedule(static) if (in.threads > 1)
-  for (int64_t first = 0; first < in.count; first += kLanes) {
+  each_block(in.threads, in.count, kLanes, [&](int64_t first) {
     const int lanes = lanes_at(first, in.count);
     store_first(weight + first, Microfacet(in, first, lanes).weight, lanes);
-  }
+  });
 }
 
 void microfacet_reflection_backward(const MicrofacetPixels& in, const float* upstream, const MicrofacetGradients& out) {
-#pragma omp parallel for num_threads(in.threads) schedule(static) if (in.threads > 1)
-  for (int64_t first = 0; first < in.count; first += kLanes) {
+  each_block(in.threads, in.count, kLanes, [&](int64_t first) {
     const int lanes = lanes_at(first, in.count);
     const Microfacet m(in, first, lanes);
     const vfloat one = broadcast(1.f), sine = one - m.cosine * m.cosine, square = m.width * m.width;
@@ -120,7 +117,7 @@ void microfacet_reflection_backward(const MicrofacetPixels& in, const float* ups
     store_first(out.cosine + first, where(m.cosine_inside, to_cosine), lanes);
     store_first(out.roughness + first, where(m.roughness_inside, to_inverse * by_width * slope / m.roughness), lanes);
     store_first(out.f0 + first, to_fresnel * (one - m.power4 * (one - m.cosine)), lanes);
-  }
+  });
 }
 
 }  // namespace rtgs::RTGS_ISA

@@ -6,10 +6,9 @@
 //   n = (alpha, beta, -(1 + alpha u + beta v)),  alpha = fx (z+ - z-) / (z+ + z-),  beta = fy (w+ - w-) / (w+ + w-),
 // which has no unit and n . c = -1: it always faces the camera, its length is at least 1 / |c|, and nothing over- or
 // underflows whatever the scale of the scene. Where either sum is 0 there is no surface and the depth normal is zero.
+#include "common/parallel.h"
 #include "image/image.h"
 #include "common/simd.h"
-
-#include <omp.h>
 
 namespace rtgs::RTGS_ISA {
 namespace {
@@ -164,24 +163,20 @@ void normal_chunk(const NormalArguments& a, const Rings& rings, int first, int e
 void normal_consistency(const NormalArguments& a) {
   int height = a.view.height;
   int chunk_rows = (height + a.threads - 1) / a.threads;
-#pragma omp parallel num_threads(a.threads) if (a.threads > 1)
-  {
-    Rings rings{a.scratch + omp_get_thread_num() * normal_scratch(a.view.width), padded_width(a.view.width)};
+  in_parts(a.threads, [&](int part) {
+    int first = part * chunk_rows, end = first + chunk_rows < height ? first + chunk_rows : height;
+    if (first >= end) return;
+    Rings rings{a.scratch + part * normal_scratch(a.view.width), padded_width(a.view.width)};
     memset(rings.start, 0, sizeof(float) * normal_scratch(a.view.width));
-#pragma omp for schedule(static)
-    for (int first = 0; first < height; first += chunk_rows) {
-      int end = first + chunk_rows < height ? first + chunk_rows : height;
-      if (a.gradient_normal) normal_chunk<true>(a, rings, first, end);
-      else normal_chunk<false>(a, rings, first, end);
-    }
-  }
+    if (a.gradient_normal) normal_chunk<true>(a, rings, first, end);
+    else normal_chunk<false>(a, rings, first, end);
+  });
 }
 
 void mono_normal(const MonoNormalArguments& a) {
   int width = a.view.width;
   long plane = long(a.view.height) * width;
-#pragma omp parallel for num_threads(a.threads) if (a.threads > 1)
-  for (int y = 0; y < a.view.height; ++y) {
+  each_in_shares(a.threads, a.view.height, [&](int64_t y) {
     vfloat one = broadcast(1.f), zero{}, total{};
     for (int x = 0; x < width; x += kLanes) {
       int count = width - x;
@@ -203,7 +198,7 @@ void mono_normal(const MonoNormalArguments& a) {
       store_vector(a.gradient_normal + at, plane, to_world(a.view.rotation, g), count);
     }
     a.rows[y] = sum(total);
-  }
+  });
 }
 
 }  // namespace rtgs::RTGS_ISA

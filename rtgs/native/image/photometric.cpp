@@ -18,10 +18,9 @@
 // Measured and left out: statistics of the target kept per view (8 % at 400x300, 4 % at 800x600, for twice the target's
 // memory); tiles of columns (8 to 20 % slower); shuffles instead of unaligned loads along the rows (no difference:
 // the sweep runs at the rate of its multiply-adds).
+#include "common/parallel.h"
 #include "image/image.h"
 #include "common/simd.h"
-
-#include <omp.h>
 
 namespace rtgs::RTGS_ISA {
 namespace {
@@ -230,33 +229,30 @@ void sweep(const PhotometricArguments& a, const Plane& p, int channel, int first
 void photometric(const PhotometricArguments& a) {
   int rows = a.channels * a.height;
   if (!a.dssim_rows) {
-#pragma omp parallel for num_threads(a.threads) if (a.threads > 1)
-    for (int row = 0; row < rows; ++row) {
+    each_in_shares(a.threads, rows, [&](int64_t row) {
       long at = long(row) * a.width;
       float* gradient = a.gradient ? a.gradient + at : nullptr;
       a.l1_rows[row] = difference_row(a.image + at, a.target + at, a.width, a.l1_scale, gradient);
-    }
+    });
     return;
   }
   constexpr int kLeastRows = 32;  // below that a chunk mostly computes its halo
   int chunks = a.threads, most = (a.height + kLeastRows - 1) / kLeastRows;
   if (chunks > most) chunks = most;
   int chunk_rows = ((a.height + chunks - 1) / chunks + kGroup - 1) / kGroup * kGroup;
-#pragma omp parallel num_threads(a.threads) if (a.threads > 1)
-  {
+  in_turns(a.threads, a.channels * chunks, 1, [&](int part, Turns& turns) {
     Plane p;
     p.height = a.height;
     p.width = a.width;
     p.stride = padded_width(a.width);
-    p.blurred = a.scratch + omp_get_thread_num() * photometric_scratch(a.width);
+    p.blurred = a.scratch + part * photometric_scratch(a.width);
     p.ring = p.blurred + kBlurRows * p.stride;
     float* zeros = p.ring + kRingSlots * kGradientMaps * p.stride;
     p.zeros = zeros;
     memset(p.blurred, 0, sizeof(float) * kBlurRows * p.stride);
     memset(zeros, 0, sizeof(float) * kGradientMaps * p.stride);
-#pragma omp for schedule(dynamic, 1)
-    for (int item = 0; item < a.channels * chunks; ++item) {
-      int channel = item / chunks, first = item % chunks * chunk_rows;
+    for (int64_t item, after; turns.next(item, after);) {
+      int channel = int(item / chunks), first = int(item % chunks) * chunk_rows;
       int end = first + chunk_rows < a.height ? first + chunk_rows : a.height;
       p.image = a.image + long(channel) * a.height * a.width;
       p.target = a.target + long(channel) * a.height * a.width;
@@ -264,7 +260,7 @@ void photometric(const PhotometricArguments& a) {
       if (a.gradient) sweep<true>(a, p, channel, first, end);
       else sweep<false>(a, p, channel, first, end);
     }
-  }
+  });
 }
 
 }  // namespace rtgs::RTGS_ISA

@@ -1,4 +1,5 @@
 // Kernels of split_sum.h for pixels, kLanes at a time.
+#include "common/parallel.h"
 #include "image/split_sum.h"
 
 #include "image/vectors.h"
@@ -52,21 +53,19 @@ struct Lobe {  // A and B of kLanes lobes, and how they depend on the place in t
 }  // namespace
 
 void lobe_weight(const LobePixels& in, float* weight) {
-#pragma omp parallel for num_threads(in.threads) schedule(static) if (in.threads > 1)
-  for (int64_t first = 0; first < in.count; first += kLanes) {
+  each_block(in.threads, in.count, kLanes, [&](int64_t first) {
     const int lanes = lanes_at(first, in.count);
     const Lobe lobe(in, first, lanes);
     for (int64_t c = 0; c < in.colors; ++c) {
       const int64_t at = c * in.count + first;
       store_first(weight + at, fma(load_first(in.reflectance + at, lanes), lobe.scale, lobe.offset), lanes);
     }
-  }
+  });
 }
 
 void lobe_weight_backward(const LobePixels& in, const float* upstream, const LobeGradients& out) {
   const float steps = float(in.side - 1), slope = steps / __builtin_sqrtf(in.widest);
-#pragma omp parallel for num_threads(in.threads) schedule(static) if (in.threads > 1)
-  for (int64_t first = 0; first < in.count; first += kLanes) {
+  each_block(in.threads, in.count, kLanes, [&](int64_t first) {
     const int lanes = lanes_at(first, in.count);
     const Lobe lobe(in, first, lanes);
     vfloat to_scale{}, to_offset{};
@@ -81,7 +80,7 @@ void lobe_weight_backward(const LobePixels& in, const float* upstream, const Lob
     const vfloat down = to_scale * lobe.scale_down + to_offset * lobe.offset_down;
     store_first(out.cosine + first, where(lobe.cosine_inside, across * steps), lanes);
     store_first(out.roughness + first, where(lobe.roughness_inside, down * slope), lanes);
-  }
+  });
 }
 
 namespace {
@@ -121,19 +120,17 @@ struct Mean {  // kLanes pixels: mean normals, and what they mirror
 }  // namespace
 
 void mean_mirror(const MeanPixels& in, float* directions, float* cosine) {
-#pragma omp parallel for num_threads(in.threads) schedule(static) if (in.threads > 1)
-  for (int64_t first = 0; first < in.count; first += kLanes) {
+  each_block(in.threads, in.count, kLanes, [&](int64_t first) {
     const int lanes = lanes_at(first, in.count);
     const Mean mean(in, first, lanes);
     store_vectors(directions, first, lanes, mean.direction);
     store_first(cosine + first, mean.cosine, lanes);
-  }
+  });
 }
 
 void mean_mirror_backward(const MeanPixels& in, const float* to_directions, const float* to_cosine,
                           const MeanGradients& out) {
-#pragma omp parallel for num_threads(in.threads) schedule(static) if (in.threads > 1)
-  for (int64_t first = 0; first < in.count; first += kLanes) {
+  each_block(in.threads, in.count, kLanes, [&](int64_t first) {
     const int lanes = lanes_at(first, in.count);
     const Mean mean(in, first, lanes);
     Vector up = load_vectors(to_directions, first, lanes), to_normal;
@@ -147,7 +144,7 @@ void mean_mirror_backward(const MeanPixels& in, const float* to_directions, cons
     for (int k = 0; k < 3; ++k) to_normal.v[k] *= mean.inverse;
     store_planes(out.normal, in.count, first, lanes, to_normal);
     store_first(out.alpha + first, in.unit ? vfloat{} : -along * mean.inverse, lanes);
-  }
+  });
 }
 
 }  // namespace rtgs::RTGS_ISA

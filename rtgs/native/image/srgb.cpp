@@ -1,5 +1,6 @@
 // Kernels of srgb.h, kLanes numbers at a time, the last of them as all others: a number's result does not depend on
 // where it stands, so threads change nothing.
+#include "common/parallel.h"
 #include "image/srgb.h"
 
 #include "common/rows.h"
@@ -30,13 +31,15 @@ inline vfloat encode_slope(vfloat light) {
   return select(gt(light, broadcast(kDarkLight)), bright, broadcast(kSlope));
 }
 
+constexpr int64_t kWorthThreads = 16384;
+
 template <typename F>
 inline void for_groups(const SrgbNumbers& in, const F& result) {  // result(numbers, first, lanes)
-#pragma omp parallel for num_threads(in.threads) schedule(static) if (in.threads > 1 && in.count > 16384)
-  for (int64_t first = 0; first < in.count; first += kLanes) {
+  const int threads = in.count > kWorthThreads ? in.threads : 1;
+  each_block(threads, in.count, kLanes, [&](int64_t first) {
     const int lanes = int(in.count - first < kLanes ? in.count - first : kLanes);
     store_first(in.to + first, result(load_first(in.from + first, lanes), first, lanes), lanes);
-  }
+  });
 }
 
 }  // namespace

@@ -3,6 +3,7 @@
 #include <cmath>
 #include <cstring>
 
+#include "common/parallel.h"
 #include "common/simd.h"
 #include "light/feature_lookup.h"
 #include "light/features.h"
@@ -265,28 +266,25 @@ void texels_of_band(const FeatureMap& map, const FeatureRays& rays, const Featur
 
 void feature_light(const FeatureMap& map, const FeatureNetwork& network, const FeatureRays& rays, float* scratch,
                    const FeatureSaved& saved, float* color) {
-#pragma omp parallel for num_threads(rays.threads) schedule(dynamic, 1) if (rays.threads > 1)
-  for (int chunk = 0; chunk < kFeatureChunks; ++chunk) {
+  each_in_turns(rays.threads, kFeatureChunks, [&](int64_t chunk) {
     const Block block = block_of(scratch + chunk * feature_scratch(network.width), network.width);
-    forward_chunk(map, network, rays, block, share_of(rays.count, chunk), saved, color);
-  }
+    forward_chunk(map, network, rays, block, share_of(rays.count, int(chunk)), saved, color);
+  });
 }
 
 void feature_light_backward(const FeatureMap& map, const FeatureNetwork& network, const FeatureRays& rays,
                             float* scratch, const FeatureSaved& saved, const float* upstream,
                             const FeatureGradients& out) {
   const int64_t weights = feature_weights(network.width);
-#pragma omp parallel for num_threads(rays.threads) schedule(dynamic, 1) if (rays.threads > 1)
-  for (int chunk = 0; chunk < kFeatureChunks; ++chunk) {
+  each_in_turns(rays.threads, kFeatureChunks, [&](int64_t chunk) {
     const Block block = block_of(scratch + chunk * feature_scratch(network.width), network.width);
     float* to = out.network + chunk * weights;
-    backward_chunk(map, network, rays, block, share_of(rays.count, chunk), saved, upstream, to, out);
-  }
+    backward_chunk(map, network, rays, block, share_of(rays.count, int(chunk)), saved, upstream, to, out);
+  });
   for (int chunk = 1; chunk < kFeatureChunks; ++chunk)
     for (int64_t k = 0; k < weights; ++k) out.network[k] += out.network[chunk * weights + k];
   const int bands = rays.threads;
-#pragma omp parallel for num_threads(bands) schedule(static, 1) if (bands > 1)
-  for (int band = 0; band < bands; ++band) texels_of_band(map, rays, saved, band, bands, out);
+  in_parts(bands, [&](int band) { texels_of_band(map, rays, saved, band, bands, out); });
 }
 
 }  // namespace rtgs::RTGS_ISA

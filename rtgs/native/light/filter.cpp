@@ -1,4 +1,5 @@
 // The filter of cubemap.h: each weight is used for eight texels and three colours at once.
+#include "common/parallel.h"
 #include "common/rows.h"
 #include "light/cubemap.h"
 
@@ -15,16 +16,15 @@ inline void add_row(vfloat* sum, float weight, const float* row) {
 
 // spread: (texels, 32) floats to work in
 void cube_filter(const CubeFilter& f, const float* x, float* spread, float* y) {
-#pragma omp parallel for num_threads(f.threads) schedule(static) if (f.threads > 1)
-  for (int64_t j = 0; j < f.texels; ++j)
+  each_in_shares(f.threads, f.texels, [&](int64_t j) {
     for (int g = 0; g < kImages; ++g) {
       const int64_t from = f.images[g * f.texels + j];
       float* to = spread + j * kRow + 4 * g;
       for (int c = 0; c < 3; ++c) to[c] = f.before[j] * x[3 * from + c];
       to[3] = 0.f;
     }
-#pragma omp parallel for num_threads(f.threads) schedule(static) if (f.threads > 1)
-  for (int64_t row = 0; row < f.rows; ++row) {
+  });
+  each_in_shares(f.threads, f.rows, [&](int64_t row) {
     vfloat even[kRegisters] = {}, odd[kRegisters] = {};
     int64_t k = f.start[row];
     const int64_t end = f.start[row + 1];
@@ -38,7 +38,7 @@ void cube_filter(const CubeFilter& f, const float* x, float* spread, float* y) {
     const int64_t texel = f.texel[row];
     for (int g = 0; g < kImages; ++g)
       for (int c = 0; c < 3; ++c) y[3 * int64_t(f.images[g * f.texels + texel]) + c] = f.after[texel] * sums[4 * g + c];
-  }
+  });
 }
 
 }  // namespace rtgs::RTGS_ISA

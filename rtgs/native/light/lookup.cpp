@@ -1,4 +1,5 @@
 // Kernels of cubemap.h: where a ray meets a cubemap is found for kLanes rays at a time, texels are fetched ray by ray.
+#include "common/parallel.h"
 #include "common/rows.h"
 #include "light/cubemap.h"
 
@@ -120,8 +121,7 @@ inline Pulled pull(const CubePyramid& pyramid, const Places& at, int lane, quad 
 }  // namespace
 
 void cube_lookup(const CubePyramid& pyramid, const CubeRays& rays, float* color) {
-#pragma omp parallel for num_threads(rays.threads) schedule(static) if (rays.threads > 1)
-  for (int64_t begin = 0; begin < rays.count; begin += kLanes) {
+  each_block(rays.threads, rays.count, kLanes, [&](int64_t begin) {
     const int lanes = int(rays.count - begin < kLanes ? rays.count - begin : kLanes);
     const Places at(pyramid, rays, begin, lanes);
     for (int lane = 0; lane < lanes; ++lane) {
@@ -132,7 +132,7 @@ void cube_lookup(const CubePyramid& pyramid, const CubeRays& rays, float* color)
       }
       for (int k = 0; k < 3; ++k) color[3 * (begin + lane) + k] = found[k];
     }
-  }
+  });
 }
 
 namespace {
@@ -177,8 +177,7 @@ void backward_of(const CubePyramid& pyramid, const CubeRays& rays, const float* 
 void cube_lookup_backward(const CubePyramid& pyramid, const CubeRays& rays, const float* upstream,
                           const CubeGradients& out) {
   if (rays.threads <= 1) return backward_of(pyramid, rays, upstream, out, 0x3f);
-#pragma omp parallel for num_threads(rays.threads) schedule(dynamic, 1)
-  for (int face = 0; face < 6; ++face) backward_of(pyramid, rays, upstream, out, 1u << face);
+  each_in_turns(rays.threads, 6, [&](int64_t face) { backward_of(pyramid, rays, upstream, out, 1u << face); });
 }
 
 }  // namespace rtgs::RTGS_ISA

@@ -1,4 +1,5 @@
 // Elementwise kernels: the result does not depend on the thread count.
+#include "common/parallel.h"
 #include "optimizer/adam.h"
 
 #include "common/simd.h"
@@ -82,13 +83,12 @@ long adam_step(const AdamTensor* tensors, int count, const AdamSettings& s) {
   long chunks = 0, bad = 0;
   for (int k = 0; k < count; ++k) chunks += chunk_total(tensors[k]);
   const int threads = useful_threads(chunks, s.threads);
-#pragma omp parallel for schedule(static) num_threads(threads) reduction(+ : bad) if (threads > 1)
-  for (long chunk = 0; chunk < chunks; ++chunk) {
+  each_in_shares(threads, chunks, [&](int64_t chunk) {
     long local = chunk;
     int k = 0;
     while (local >= chunk_total(tensors[k])) local -= chunk_total(tensors[k++]);
-    bad += update_chunk(tensors[k], local, s);
-  }
+    if (const long wrong = update_chunk(tensors[k], local, s)) __atomic_fetch_add(&bad, wrong, __ATOMIC_RELAXED);
+  });
   return bad;
 }
 
@@ -96,8 +96,7 @@ long count_nonfinite(const float* values, long count, int threads) {
   long bad = 0;
   const long chunks = (count + kChunk - 1) / kChunk;
   threads = useful_threads(chunks, threads);
-#pragma omp parallel for schedule(static) num_threads(threads) reduction(+ : bad) if (threads > 1)
-  for (long chunk = 0; chunk < chunks; ++chunk) {
+  each_in_shares(threads, chunks, [&](int64_t chunk) {
     const float* p = values + chunk * kChunk;
     const long left = count - chunk * kChunk, length = left < kChunk ? left : kChunk;
     int wrong = 0;
@@ -106,8 +105,8 @@ long count_nonfinite(const float* values, long count, int threads) {
       memcpy(&bits, p + i, sizeof bits);
       wrong += (bits & kExponent) == kExponent;
     }
-    bad += wrong;
-  }
+    if (wrong) __atomic_fetch_add(&bad, long(wrong), __ATOMIC_RELAXED);
+  });
   return bad;
 }
 

@@ -1,4 +1,5 @@
 // The surfels' backward pass over tiles, and what backward passes of every kind of Gaussian share.
+#include "common/parallel.h"
 #include "raster/backward.h"
 
 #include "raster/surfel_footprint.h"
@@ -23,8 +24,7 @@ void split_work(const BackwardArgs& args) {
 void add_waiting(const BackwardArgs& args, int64_t count) {
   const int threads = args.forward.threads;
   const RecordLayout& layout = args.forward.gaussians.layout;
-#pragma omp parallel for num_threads(threads) schedule(static, 1)
-  for (int part = 0; part < threads; ++part) {
+  in_parts(threads, [&](int part) {
     const int64_t begin = count * part / threads, end = count * (part + 1) / threads;
     for (int range = 1; range < threads; ++range) {
       const int64_t first = args.forward.tiles.starts[args.range_starts[range]];
@@ -36,7 +36,7 @@ void add_waiting(const BackwardArgs& args, int64_t count) {
         for (int j = 0; j < layout.gradient_sums; j += kLanes) store(row + j, load(row + j) + load(from + j));
       }
     }
-  }
+  });
 }
 
 namespace {

@@ -2,6 +2,7 @@
 // state is `rest`, the upstream gradient times what the Gaussians not yet passed add to the pixel. All sums over the
 // pixels of one (Gaussian, tile) stay in registers and are reduced once.
 #pragma once
+#include "common/parallel.h"
 #include "raster/block.h"
 
 namespace rtgs::RTGS_ISA {
@@ -148,8 +149,7 @@ template <class Footprint, int C, bool kExtras>
 void backward_tiles(const BackwardArgs& args) {
   const int threads = args.forward.threads;
   split_work(args);
-#pragma omp parallel for num_threads(threads) schedule(static, 1) if (threads > 1)
-  for (int part = 0; part < threads; ++part) {
+  in_parts(threads, [&](int part) {
     alignas(64) TileBackward<Footprint, C, kExtras> state;
     if (kExtras) memset(static_cast<void*>(state.extras), 0, sizeof state.extras);
     const int begin = int(args.range_starts[part]), end = int(args.range_starts[part + 1]);
@@ -162,7 +162,7 @@ void backward_tiles(const BackwardArgs& args) {
       state.run(args, tile, range);
     }
     args.waiting_counts[part] = range.waiting - first_waiting;
-  }
+  });
 }
 
 template <class Footprint, int C>

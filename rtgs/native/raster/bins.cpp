@@ -1,5 +1,6 @@
 // Which Gaussians touch which tile, front to back: one stable radix sort by depth, then a counting sort by tile. Every
 // step is a stable partition, so the lists do not depend on the number of threads.
+#include "common/parallel.h"
 #include "common/radix.h"
 #include "raster/raster.h"
 
@@ -34,8 +35,7 @@ int64_t count_tiles(const RasterCamera& camera, const ProjectedGaussians& gaussi
                     int64_t* cursors, int64_t* starts, int threads) {
   const int tiles_x = camera.tiles_x();
   const int64_t tiles = int64_t(tiles_x) * camera.tiles_y();
-#pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1)
-  for (int part = 0; part < threads; ++part) {
+  in_parts(threads, [&](int part) {
     const Chunk chunk = chunk_of(visible, part, threads);
     int64_t* mine = cursors + part * tiles;
     memset(mine, 0, tiles * sizeof(int64_t));
@@ -44,7 +44,7 @@ int64_t count_tiles(const RasterCamera& camera, const ProjectedGaussians& gaussi
       for (int y = r.y0; y <= r.y1; ++y)
         for (int x = r.x0; x <= r.x1; ++x) ++mine[int64_t(y) * tiles_x + x];
     }
-  }
+  });
   int64_t start = 0;
   for (int64_t tile = 0; tile < tiles; ++tile) {
     starts[tile] = start;
@@ -62,8 +62,7 @@ void fill_tiles(const RasterCamera& camera, const ProjectedGaussians& gaussians,
                 int64_t* cursors, int32_t* ids, int threads) {
   const int tiles_x = camera.tiles_x();
   const int64_t tiles = int64_t(tiles_x) * camera.tiles_y();
-#pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1)
-  for (int part = 0; part < threads; ++part) {
+  in_parts(threads, [&](int part) {
     const Chunk chunk = chunk_of(visible, part, threads);
     int64_t* mine = cursors + part * tiles;
     for (int64_t k = chunk.begin; k < chunk.end; ++k) {
@@ -72,7 +71,7 @@ void fill_tiles(const RasterCamera& camera, const ProjectedGaussians& gaussians,
       for (int y = r.y0; y <= r.y1; ++y)
         for (int x = r.x0; x <= r.x1; ++x) ids[mine[int64_t(y) * tiles_x + x]++] = id;
     }
-  }
+  });
 }
 
 }  // namespace rtgs::RTGS_ISA

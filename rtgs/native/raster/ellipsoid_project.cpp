@@ -1,4 +1,5 @@
 // World to screen: one record, one tile rectangle and one depth per ellipsoid.
+#include "common/parallel.h"
 #include "raster/ellipsoid_geometry.h"
 
 namespace rtgs::RTGS_ISA {
@@ -50,8 +51,7 @@ void project_ellipsoids(const RasterCamera& camera, const EllipsoidSettings& set
                         const ProjectedGaussians& out, int threads) {
   const RecordLayout layout = out.layout;
   const int64_t groups = (in.count + kLanes - 1) / kLanes;
-#pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1)
-  for (int64_t group = 0; group < groups; ++group) {
+  each_in_shares(threads, groups, [&](int64_t group) {
     const int64_t first = group * kLanes;
     const int lanes = int(in.count - first < kLanes ? in.count - first : kLanes);
     const Projection p = project_lanes(camera, settings, ellipsoid_geometry(camera, settings, in, first));
@@ -68,7 +68,7 @@ void project_ellipsoids(const RasterCamera& camera, const EllipsoidSettings& set
         write_channels(layout, features, in.channels, p.depth[lane],
                        records + lane * layout.record_stride + Record::kChannels);
     }
-  }
+  });
 }
 
 }  // namespace rtgs::RTGS_ISA

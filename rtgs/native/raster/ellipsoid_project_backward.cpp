@@ -1,4 +1,5 @@
 // From the sums over an ellipsoid's pixels to the gradients of its parameters: the chain rule of ellipsoid_geometry.h.
+#include "common/parallel.h"
 #include "raster/ellipsoid_geometry.h"
 
 namespace rtgs::RTGS_ISA {
@@ -80,8 +81,7 @@ void project_ellipsoids_backward(const ProjectBackwardArgs& args, const Ellipsoi
   const GaussianArrays& in = args.inputs;
   const GaussianGradients& out = args.out;
   const int64_t groups = (in.count + kLanes - 1) / kLanes;
-#pragma omp parallel for num_threads(args.threads) schedule(static) if (args.threads > 1)
-  for (int64_t group = 0; group < groups; ++group) {
+  each_in_shares(args.threads, groups, [&](int64_t group) {
     const GradientRows rows(args, group * kLanes);
     const EllipsoidGeometry g = ellipsoid_geometry(args.camera, settings, in, rows.first);
     ParameterGradients p = chain_rule(args.camera, g, args.gaussians.layout, rows, in.channels);
@@ -93,7 +93,7 @@ void project_ellipsoids_backward(const ProjectBackwardArgs& args, const Ellipsoi
     rows.write<1>(out.opacities, {p.opacity});
     rows.write(out.screen_probe, p.probe);
     rows.write_features(out.features, in.channels, Sums::kChannels);
-  }
+  });
 }
 
 }  // namespace rtgs::RTGS_ISA

@@ -1,6 +1,7 @@
 // Compositing, front to back: Gaussian by Gaussian over a tile, block by block within, the sums of a tile staying in L1.
 // What a Gaussian is, is the footprint's affair (surfel_footprint.h, ellipsoid_footprint.h).
 #pragma once
+#include "common/parallel.h"
 #include "raster/block.h"
 
 namespace rtgs::RTGS_ISA {
@@ -117,17 +118,16 @@ void TileForward<Footprint, C, kExtras>::write(const ForwardArgs& args, const Ti
 template <class Footprint, int C, bool kExtras>
 void forward_tiles(const ForwardArgs& args) {
   const int tiles = args.camera.tiles_x() * args.camera.tiles_y();
-#pragma omp parallel num_threads(args.threads) if (args.threads > 1)
-  {
+  in_turns(args.threads, tiles, 4, [&](int, Turns& turns) {
     alignas(64) TileForward<Footprint, C, kExtras> state;
-#pragma omp for schedule(dynamic, 4)
-    for (int index = 0; index < tiles; ++index) {
-      const Tile tile(args.camera, index);
-      state.clear(args.camera, tile);
-      state.composite(args, tile);
-      state.write(args, tile);
-    }
-  }
+    for (int64_t index, end; turns.next(index, end);)
+      for (; index < end; ++index) {
+        const Tile tile(args.camera, int(index));
+        state.clear(args.camera, tile);
+        state.composite(args, tile);
+        state.write(args, tile);
+      }
+  });
 }
 
 template <class Footprint, int C>

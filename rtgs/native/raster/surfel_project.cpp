@@ -1,4 +1,5 @@
 // World to screen: one record, one tile rectangle and one depth per surfel.
+#include "common/parallel.h"
 #include "raster/surfel_geometry.h"
 
 namespace rtgs::RTGS_ISA {
@@ -115,8 +116,7 @@ void write_channels(const RecordLayout& layout, const Projection& p, int lane, c
 void project_surfels(const RasterCamera& camera, const GaussianArrays& in, const ProjectedGaussians& out, int threads) {
   const RecordLayout layout = out.layout;
   const int64_t groups = (in.count + kLanes - 1) / kLanes;
-#pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1)
-  for (int64_t group = 0; group < groups; ++group) {
+  each_in_shares(threads, groups, [&](int64_t group) {
     const int64_t first = group * kLanes;
     const int lanes = int(in.count - first < kLanes ? in.count - first : kLanes);
     SurfelGeometry g = surfel_geometry(camera, in, first);
@@ -141,7 +141,7 @@ void project_surfels(const RasterCamera& camera, const GaussianArrays& in, const
         depth[1] = p.depth[lane];
       }
     }
-  }
+  });
 }
 
 }  // namespace rtgs::RTGS_ISA

@@ -1,4 +1,5 @@
 // From the sums over a surfel's pixels to the gradients of its parameters: the chain rule of surfel_project.cpp.
+#include "common/parallel.h"
 #include "raster/surfel_geometry.h"
 
 namespace rtgs::RTGS_ISA {
@@ -77,8 +78,7 @@ void project_backward(const ProjectBackwardArgs& args) {
   const GaussianArrays& in = args.inputs;
   const GaussianGradients& out = args.out;
   const int64_t groups = (in.count + kLanes - 1) / kLanes;
-#pragma omp parallel for num_threads(args.threads) schedule(static) if (args.threads > 1)
-  for (int64_t group = 0; group < groups; ++group) {
+  each_in_shares(args.threads, groups, [&](int64_t group) {
     const GradientRows rows(args, group * kLanes);
     const SurfelGeometry g = surfel_geometry(args.camera, in, rows.first);
     ParameterGradients p = chain_rule(args.camera, g, layout, rows);
@@ -91,7 +91,7 @@ void project_backward(const ProjectBackwardArgs& args) {
     rows.write<1>(out.opacities, {p.opacity});
     rows.write<2>(out.screen_probe, {p.probe_x, p.probe_y});
     rows.write_features(out.features, in.channels, kGradChannels);
-  }
+  });
 }
 
 }  // namespace rtgs::RTGS_ISA

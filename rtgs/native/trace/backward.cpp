@@ -1,7 +1,7 @@
 // Gradients of a packet from its tape (docs/tracer.md): responses surfel by surfel, the recursion along the rays row by
 // row, then all sums surfel by surfel, with rays as lanes and one transposed reduction per (surfel, packet). Surfels come
 // by ascending id, so that the sums of a ray do not depend on the tree.
-#include "common/rethrow.h"
+#include "common/parallel.h"
 #include "trace/ray_rows.h"
 
 namespace rtgs::RTGS_ISA {
@@ -294,16 +294,12 @@ void trace_backward(const TraceBackwardArgs& args) {
   const int threads = args.options.threads;
   split_work(args);
   for (int part = 0; part < threads; ++part) workspace_of(args.workspaces, part).waiting = 0;
-  InParallel region;
-#pragma omp parallel for num_threads(threads) schedule(static, 1) if (threads > 1)
-  for (int part = 0; part < threads; ++part)
-    region.run([&] {
-      TraceWorkspace& work = workspace_of(args.workspaces, part);
-      const ColorMasks masks(args.surfels.feature_count());
-      for (int64_t packet = args.range_starts[part]; packet < args.range_starts[part + 1]; ++packet)
-        PacketBackward(args, work, masks, packet, part).run();
-    });
-  region.end();
+  in_parts(threads, [&](int part) {
+    TraceWorkspace& work = workspace_of(args.workspaces, part);
+    const ColorMasks masks(args.surfels.feature_count());
+    for (int64_t packet = args.range_starts[part]; packet < args.range_starts[part + 1]; ++packet)
+      PacketBackward(args, work, masks, packet, part).run();
+  });
   if (threads > 1 && args.surfel_gradients) add_waiting(args);
 }
 

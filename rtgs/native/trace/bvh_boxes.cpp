@@ -1,4 +1,5 @@
 // Bounding boxes of surfels, kLanes at a time.
+#include "common/parallel.h"
 #include "trace/bvh.h"
 #include "trace/surfels.h"
 
@@ -8,8 +9,7 @@ namespace rtgs::RTGS_ISA {
 // of its extent, off the plane by a part of its distance from the world's origin (the tracer pads by the ray's own).
 void surfel_boxes(const SurfelArrays& in, float alpha_cutoff, SurfelBox* boxes, int threads) {
   const int64_t groups = (in.count + kLanes - 1) / kLanes;
-#pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1)
-  for (int64_t group = 0; group < groups; ++group) {
+  each_in_shares(threads, groups, [&](int64_t group) {
     const int64_t first = group * kLanes;
     const SurfelLanes s(in, first, alpha_cutoff);
     const vfloat radius = sqrt(max(s.reach, broadcast(0.f)));
@@ -33,7 +33,7 @@ void surfel_boxes(const SurfelArrays& in, float alpha_cutoff, SurfelBox* boxes, 
       for (int k = 0; k < 3; ++k) box.low[k] = low[k][lane], box.high[k] = high[k][lane];
       box.low[3] = box.high[3] = 0.f;
     }
-  }
+  });
 }
 
 }  // namespace rtgs::RTGS_ISA

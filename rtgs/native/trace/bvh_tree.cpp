@@ -1,3 +1,4 @@
+#include "common/parallel.h"
 #include "trace/bvh_tree.h"
 
 #include <algorithm>
@@ -233,8 +234,7 @@ void SurfelTree::refit(const SurfelArrays& surfels, float alpha_cutoff, int thre
                                 " surfels, got " + std::to_string(surfels.count) + "; build it anew");
   measure_boxes(surfels, alpha_cutoff, threads);
   const int64_t count = nodes();
-#pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1)
-  for (int64_t i = 0; i < count; ++i) refit_leaves(nodes_[i]);
+  baseline::each_in_shares(threads, count, [&](int64_t i) { refit_leaves(nodes_[i]); });
   for (int64_t i = count - 1; i >= 0; --i) refit_inner(nodes_[i]);
 }
 

@@ -3,9 +3,7 @@
 // final.
 // Hits of a lane are composited in the order of (t, surfel id), and per-ray sums over surfels run by ascending id, so
 // nothing depends on the shape of the tree.
-#include <omp.h>
-
-#include "common/rethrow.h"
+#include "common/parallel.h"
 #include "trace/sort.h"
 #include "trace/traverse.h"
 
@@ -353,20 +351,17 @@ int packet_lanes() { return kLanes; }
 void trace_forward(TraceForwardArgs& args) {
   const int64_t packets = packet_count(args.rays);
   int64_t hits = 0;
-  InParallel region;
-#pragma omp parallel num_threads(args.options.threads) reduction(+ : hits) if (args.options.threads > 1)
-  {
-    const int thread = omp_get_thread_num();
-#pragma omp for schedule(dynamic, 16)
-    for (int64_t packet = 0; packet < packets; ++packet)
-      region.run([&] {
-        PacketTracer tracer(args, workspace_of(args.workspaces, thread), packet);
+  in_turns(args.options.threads, packets, 16, [&](int part, Turns& turns) {
+    int64_t found = 0;
+    for (int64_t packet, end; turns.next(packet, end);)
+      for (; packet < end; ++packet) {
+        PacketTracer tracer(args, workspace_of(args.workspaces, part), packet);
         tracer.run();
-        tracer.write(args.tapes ? args.tapes + packet : nullptr, args.arenas + thread);
-        hits += tracer.hits();
-      });
-  }
-  region.end();
+        tracer.write(args.tapes ? args.tapes + packet : nullptr, args.arenas + part);
+        found += tracer.hits();
+      }
+    __atomic_fetch_add(&hits, found, __ATOMIC_RELAXED);
+  });
   args.hits = hits;
 }
 
@@ -374,8 +369,7 @@ void trace_forward(TraceForwardArgs& args) {
 void sum_packet_weights(const TraceForwardArgs& args, float* weight_sum) {
   const int threads = args.options.threads;
   const int64_t packets = packet_count(args.rays), count = args.tree.surfels;
-#pragma omp parallel for num_threads(threads) schedule(static, 1) if (threads > 1)
-  for (int part = 0; part < threads; ++part) {
+  in_parts(threads, [&](int part) {
     const int64_t begin = count * part / threads, end = count * (part + 1) / threads;
     memset(weight_sum + begin, 0, size_t(end - begin) * sizeof(float));
     for (int64_t packet = 0; packet < packets; ++packet) {
@@ -385,7 +379,7 @@ void sum_packet_weights(const TraceForwardArgs& args, float* weight_sum) {
         if (id >= begin && id < end) weight_sum[id] += tape.weights[k];
       }
     }
-  }
+  });
 }
 
 void free_trace_workspace(void* workspace) {

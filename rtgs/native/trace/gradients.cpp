@@ -1,4 +1,5 @@
 // From the sums over a surfel's hits to the gradients of its parameters: the chain rule of records.cpp.
+#include "common/parallel.h"
 #include "common/rows.h"
 #include "trace/trace.h"
 #include "trace/surfels.h"
@@ -103,15 +104,14 @@ void GradientGroup::write(const TraceGradients& out) {
 void trace_surfel_gradients(const TraceBackwardArgs& args, const int32_t* slots, const TraceGradients& out,
                             bool saturate) {
   const int64_t count = args.surfels.arrays.count, groups = (count + kLanes - 1) / kLanes;
-#pragma omp parallel for num_threads(args.options.threads) schedule(static) if (args.options.threads > 1)
-  for (int64_t group = 0; group < groups; ++group) {
+  each_in_shares(args.options.threads, groups, [&](int64_t group) {
     const int64_t ahead = (group + kPrefetchGroups) * kLanes;
     for (int64_t id = ahead; id < count && id < ahead + kLanes; ++id) {
       const float* row = args.rows + int64_t(slots[id]) * args.row_stride;
       for (int c = 0; c < args.row_stride; c += 16) __builtin_prefetch(row + c);
     }
     GradientGroup(args, slots, saturate, group * kLanes).write(out);
-  }
+  });
 }
 
 }  // namespace rtgs::RTGS_ISA

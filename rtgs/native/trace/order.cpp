@@ -1,6 +1,7 @@
 // The order in which packets take rays: as they come, or along a Morton curve through directions and origins. Measured
 // (docs/tracer.md): what decides the time of a packet is how far its rays are apart when they reach the surfels, so a
 // direction counts by its angle and an origin by its distance in parts of the scene's size.
+#include "common/parallel.h"
 #include "common/radix.h"
 #include "trace/trace.h"
 #include "common/simd.h"
@@ -35,8 +36,7 @@ float tree_size(const TreeView& tree) {
 // Coordinates of all rays, one array per axis; rays that are not finite get zeros.
 void ray_coordinates(const TraceRays& rays, float size, float* const* axes, int threads) {
   const float scale = kOriginWeight / size;
-#pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1)
-  for (int64_t first = 0; first < rays.count; first += kLanes) {
+  each_block(threads, rays.count, kLanes, [&](int64_t first) {
     const int lanes = int(rays.count - first < kLanes ? rays.count - first : kLanes);
     const vint row = min_int(truncate(lane_numbers()), broadcast_int(lanes - 1)) * 3;
     const float *o = rays.origins + 3 * first, *d = rays.directions + 3 * first;
@@ -50,7 +50,7 @@ void ray_coordinates(const TraceRays& rays, float size, float* const* axes, int 
                                        gather(o, row) * scale, gather(o + 1, row) * scale, gather(o + 2, row) * scale};
     for (int k = 0; k < kAxes; ++k)
       store_first(axes[k] + first, where(finite(coordinates[k]), coordinates[k]), lanes);
-  }
+  });
 }
 
 Extent extent_of(const float* const* axes, int64_t count) {
@@ -151,12 +151,11 @@ bool order_rays(const RayOrderArgs& args) {
   ray_coordinates(rays, tree_size(args.tree), axes, args.threads);
   const MortonCells cells(extent_of(axes, rays.count));
   if (!cells.used || (!args.always && !worth_sorting(args, axes, cells))) return false;
-#pragma omp parallel for num_threads(args.threads) schedule(static) if (args.threads > 1)
-  for (int64_t first = 0; first < rays.count; first += kLanes) {
+  each_block(args.threads, rays.count, kLanes, [&](int64_t first) {
     const int lanes = int(rays.count - first < kLanes ? rays.count - first : kLanes);
     const vint key = cells.key(axes, first, lanes);
     for (int lane = 0; lane < lanes; ++lane) args.spare[first + lane] = {uint32_t(key[lane]), uint32_t(first + lane)};
-  }
+  });
   radix_sort(args.spare, args.keys, rays.count, args.scratch, args.threads);
   for (int64_t i = 0; i < rays.count; ++i) args.order[i] = int32_t(args.keys[i].id);
   return true;

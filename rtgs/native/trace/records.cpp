@@ -1,4 +1,5 @@
 // Surfels to the records that rays read, in the order of the tree's leaves.
+#include "common/parallel.h"
 #include "trace/trace.h"
 #include "trace/surfels.h"
 
@@ -7,26 +8,20 @@ namespace rtgs::RTGS_ISA {
 // slots: row -> slot, the inverse of the tree's ids.
 void trace_records(const SurfelArrays& in, const TreeView& tree, float alpha_cutoff, float* records, int32_t* slots,
                    int threads) {
-#pragma omp parallel num_threads(threads) if (threads > 1)
-  {
-#pragma omp for schedule(static)
-    for (int64_t slot = 0; slot < in.count; ++slot) slots[tree.ids[slot]] = int32_t(slot);
-#pragma omp for schedule(static)
-    for (int64_t group = 0; group < (in.count + kLanes - 1) / kLanes; ++group) {
-      const int64_t first = group * kLanes;
-      const SurfelLanes s(in, first, alpha_cutoff);
-      const vfloat iu = 1.f / s.scale_u, iv = 1.f / s.scale_v;
-      const vfloat fields[] = {s.mean.x, s.mean.y, s.mean.z, s.normal.x, s.normal.y, s.normal.z,
-                               s.tangent_u.x * iu, s.tangent_u.y * iu, s.tangent_u.z * iu,
-                               s.tangent_v.x * iv, s.tangent_v.y * iv, s.tangent_v.z * iv, s.reach, s.log_opacity,
-                               (vfloat)s.row, broadcast(0.f)};
-      const int64_t lanes = in.count - first < kLanes ? in.count - first : kLanes;
-      for (int64_t lane = 0; lane < lanes; ++lane) {
-        float* record = records + int64_t(kTraceFields) * slots[first + lane];
-        for (int k = 0; k < kTraceFields; ++k) record[k] = fields[k][lane];
-      }
+  each_in_shares(threads, in.count, [&](int64_t slot) { slots[tree.ids[slot]] = int32_t(slot); });
+  each_block(threads, in.count, kLanes, [&](int64_t first) {
+    const SurfelLanes s(in, first, alpha_cutoff);
+    const vfloat iu = 1.f / s.scale_u, iv = 1.f / s.scale_v;
+    const vfloat fields[] = {s.mean.x, s.mean.y, s.mean.z, s.normal.x, s.normal.y, s.normal.z,
+                             s.tangent_u.x * iu, s.tangent_u.y * iu, s.tangent_u.z * iu,
+                             s.tangent_v.x * iv, s.tangent_v.y * iv, s.tangent_v.z * iv, s.reach, s.log_opacity,
+                             (vfloat)s.row, broadcast(0.f)};
+    const int64_t lanes = in.count - first < kLanes ? in.count - first : kLanes;
+    for (int64_t lane = 0; lane < lanes; ++lane) {
+      float* record = records + int64_t(kTraceFields) * slots[first + lane];
+      for (int k = 0; k < kTraceFields; ++k) record[k] = fields[k][lane];
     }
-  }
+  });
 }
 
 }  // namespace rtgs::RTGS_ISA

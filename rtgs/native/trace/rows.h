@@ -1,5 +1,6 @@
 // Gradient rows of the tracer's backward pass: their layout, and how threads share them.
 #pragma once
+#include "common/parallel.h"
 #include "trace/packet.h"
 
 namespace rtgs::RTGS_ISA {
@@ -31,8 +32,7 @@ static inline void split_work(const TraceBackwardArgs& args) {
   while (range <= threads) args.range_starts[range++] = packets;
   if (threads == 1 || !args.surfel_gradients) return;
   memset(args.owners, 0x7f, size_t(args.surfels.arrays.count) * sizeof(int32_t));
-#pragma omp parallel for num_threads(threads) schedule(static, 1)
-  for (int part = 0; part < threads; ++part)
+  in_parts(threads, [&](int part) {
     for (int64_t packet = args.range_starts[part]; packet < args.range_starts[part + 1]; ++packet)
       for (int32_t k = 0; k < args.tapes[packet].surfels; ++k) {
         int32_t* owner = args.owners + args.tapes[packet].slots[k];
@@ -41,6 +41,7 @@ static inline void split_work(const TraceBackwardArgs& args) {
                !__atomic_compare_exchange_n(owner, &before, part, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {
         }
       }
+  });
 }
 
 // Each thread takes a share of the slots, so that the order of additions to a row is that of the packets.
@@ -48,8 +49,7 @@ static inline void add_waiting(const TraceBackwardArgs& args) {
   const int threads = args.options.threads;
   const int64_t count = args.surfels.arrays.count;
   const int floats = RowLayout(args.surfels).floats;
-#pragma omp parallel for num_threads(threads) schedule(static, 1)
-  for (int part = 0; part < threads; ++part) {
+  in_parts(threads, [&](int part) {
     const int64_t begin = count * part / threads, end = count * (part + 1) / threads;
     for (int range = 1; range < threads; ++range) {
       TraceWorkspace& from = workspace_of(args.workspaces, range);
@@ -61,7 +61,7 @@ static inline void add_waiting(const TraceBackwardArgs& args) {
         for (int c = 0; c < floats; c += kLanes) store(row + c, load(row + c) + load(waiting + c));
       }
     }
-  }
+  });
 }
 
 }  // namespace rtgs::RTGS_ISA
