@@ -15,7 +15,9 @@ from __future__ import annotations
 
 import os
 
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # a waiting thread must not count as working; before torch loads
+os.environ.setdefault(
+    "OMP_WAIT_POLICY", "passive"
+)  # a waiting thread of torch must not count as working; before it loads
 
 import argparse
 import importlib.util

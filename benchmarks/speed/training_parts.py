@@ -13,7 +13,9 @@ from __future__ import annotations
 
 import os
 
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # a waiting thread must not count as working; before torch loads
+os.environ.setdefault(
+    "OMP_WAIT_POLICY", "passive"
+)  # a waiting thread of torch must not count as working; before it loads
 
 import argparse
 import json
@@ -29,6 +31,7 @@ import torch
 
 from benchmarks.common.machine import machine
 from benchmarks.common.training_runs import schedule_overrides
+from rtgs.native.threads import work_time
 
 if TYPE_CHECKING:
     from rtgs.config.schema import RunConfig
@@ -166,10 +169,10 @@ def stage_shares(
 
     clock = PartClock(now)
     trainer = Trainer(method, scene, seed=seed, stage=stage)
-    began = time.process_time()
+    began = work_time()
     with clocks(clock), clock.part("shading"):
         trainer.run()
-    spent = time.process_time() - began
+    spent = work_time() - began
     seconds = sum(clock.seconds.values())
     steps = stage.until - stage.from_step
     fixed = steps * fixed_seconds(method, scene, stage, now)
@@ -253,10 +256,10 @@ def measure(words: Sequence[str], shrunk: Sequence[str], threads: int) -> Traini
     method, found, times = new(), [], (0.0, 0.0)
     for stage, complete in zip(*both, strict=True):
         if stage.name == "transmittance":
-            start = clock(), time.process_time()
+            start = clock(), work_time()
             third = new(found_mesh(method, stage.from_step, scene, config))
             third.load({name: tensor.clone() for name, tensor in method.state().items()})
-            times, method = (clock() - start[0], time.process_time() - start[1]), third
+            times, method = (clock() - start[0], work_time() - start[1]), third
         steps = complete.until - complete.from_step
         found.append(stage_shares(method, scene, config.seed, clock, stage, steps))
     return Training(tuple(found), *times)

@@ -54,8 +54,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if command is None:
         print(f"rtgs: {_unknown(words[0])}", file=sys.stderr)
         return 2
-    # Threads of torch that wait by spinning starve each other as soon as a machine has anything else to do (measured:
-    # ten times slower under load), the core's own among them; must be set before torch is loaded.
+    # Threads of torch that wait by spinning starve each other and the core as soon as a machine has anything else to do
+    # (measured: ten times slower under load); must be set before torch is loaded.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     try:
         with sigterm_raises():

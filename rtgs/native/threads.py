@@ -7,54 +7,63 @@ on two threads they take longer than on one (docs/lab/benchmarks.md).
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 
 import torch
 
+from rtgs.native import core
+
 SERIAL_PIXELS = 1 << 18  # of a picture, up to which waking threads costs torch's operations more than it brings
 
-_kernels: int | None = None  # None: as many as torch
+_kernels: ContextVar[int | None] = ContextVar("kernels", default=None)  # None: as many as torch
 
 
 def threads() -> int:
     """Of every kernel: as many as torch has, or had before :func:`serial_torch`."""
-    return _kernels or torch.get_num_threads()
+    return _kernels.get() or torch.get_num_threads()
+
+
+def work_time() -> float:
+    """CPU seconds of this process, all threads, less what the core's spent waiting awake for work: that depends on what
+    else the machine does."""
+    return time.process_time() - core.seconds_awake()
 
 
 @contextmanager
 def serial_torch(wanted: bool = True) -> Iterator[None]:
     """While the block runs, torch's own operations take one thread and the kernels as many as before; ``wanted`` False:
     nothing changes."""
-    global _kernels
     if not wanted:
         yield
         return
-    outer, _kernels = _kernels, threads()
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
+    before = _kernels.set(threads())
     try:
-        yield
+        with _torch_threads(1):
+            yield
     finally:
-        torch.set_num_threads(before)
-        _kernels = outer
+        _kernels.reset(before)
 
 
 @contextmanager
 def threaded_torch() -> Iterator[None]:
     """While the block runs, torch's own operations take as many threads as the kernels: for networks."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads())
+    with _torch_threads(threads()):
+        yield
+
+
+@contextmanager
+def _torch_threads(count: int) -> Iterator[None]:
+    before, process = torch.get_num_threads(), os.getpid()
+    torch.set_num_threads(count)
     try:
         yield
     finally:
-        torch.set_num_threads(before)
-
-
-def _in_forked_child() -> None:
-    global _kernels
-    _kernels = None
+        if os.getpid() == process:  # a child keeps its one thread
+            torch.set_num_threads(before)
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_in_forked_child)
+    os.register_at_fork(after_in_child=lambda: _kernels.set(None))

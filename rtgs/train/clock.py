@@ -1,9 +1,11 @@
-"""How long a training took: by the wall, and in CPU time, which is the same on a busy machine."""
+"""How long a training took: by the wall, and in CPU time of its work, which is the same on a busy machine."""
 
 from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
+
+from rtgs.native.threads import work_time
 
 
 @dataclass(frozen=True)
@@ -11,7 +13,7 @@ class ElapsedTime:
     """A duration."""
 
     wall: float = 0.0  # seconds
-    cpu: float = 0.0  # seconds of this process, all threads
+    cpu: float = 0.0  # seconds of this process, all threads, at work
 
     def __add__(self, other: ElapsedTime) -> ElapsedTime:
         return ElapsedTime(self.wall + other.wall, self.cpu + other.cpu)
@@ -25,11 +27,11 @@ class Clock:
     """Runs from when it is made."""
 
     _wall: float = field(default_factory=time.monotonic)
-    _cpu: float = field(default_factory=time.process_time)
+    _cpu: float = field(default_factory=work_time)
 
     def elapsed(self) -> ElapsedTime:
         """Time since the clock was made."""
-        return ElapsedTime(time.monotonic() - self._wall, time.process_time() - self._cpu)
+        return ElapsedTime(time.monotonic() - self._wall, work_time() - self._cpu)
 
     def without(self, spent: ElapsedTime) -> Clock:
         """The clock as if it had stood still for so long."""

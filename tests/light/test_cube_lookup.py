@@ -105,7 +105,7 @@ def test_directions_without_a_direction_are_harmless_and_what_is_no_number_stays
 
 
 @pytest.mark.parametrize("sides", [(8,), SIDES])
-def test_bits_do_not_depend_on_the_number_of_threads(sides: tuple[int, ...]):
+def test_bits_do_not_depend_on_the_number_of_threads(isa, sides: tuple[int, ...]):
     texels, directions, level = drawn(5000, sides, torch.float32)
     results = []
     for threads in (1, 2, 5):

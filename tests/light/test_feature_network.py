@@ -96,7 +96,7 @@ def test_a_surface_without_length_has_torchs_gradient():
     torch.testing.assert_close(single[3].grad, twin[3].grad, rtol=1e-3, atol=1e-3)
 
 
-def test_bits_do_not_depend_on_the_number_of_threads():
+def test_bits_do_not_depend_on_the_number_of_threads(isa):
     results = []
     given = drawn(5000, 16, 24)
     for threads in (1, 2, 5, 40):

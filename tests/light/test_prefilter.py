@@ -98,7 +98,7 @@ def test_shrinking_is_the_mean_and_refuses_other_sides():
         shrunk(texels, 3)
 
 
-def test_filter_bits_do_not_depend_on_the_number_of_threads():
+def test_filter_bits_do_not_depend_on_the_number_of_threads(isa):
     texels = torch.randn(6 * 16**2, 3, generator=torch.Generator().manual_seed(5))
     found = []
     for threads in (1, 3):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 import torch
@@ -98,13 +99,21 @@ def test_the_cosine_can_be_cut_off_natively():
     assert leaves[1].grad is not None
 
 
-def test_threads_change_nothing():
-    pixels, view, center = drawn_pixels(500)
+@pytest.mark.parametrize("raw", [False, True])
+def test_threads_change_nothing(isa, raw):
+    pixels, view, center = drawn_pixels(20_001)
+    numbers = torch.rand(3, 20_001, generator=torch.Generator().manual_seed(1))
     before = torch.get_num_threads()
     found = []
-    for threads in (1, 3):
+    for threads in (1, 2, 3):
         torch.set_num_threads(threads)
-        rays = mirror_rays(pixels, center, view)
-        found.append((rays.origins, rays.directions, rays.cosine))
+        leaves = [each.clone().requires_grad_() for each in (pixels.normal, pixels.depth, *numbers)]
+        given = replace(pixels, normal=leaves[0], depth=leaves[1])
+        rays = mirror_rays(given, center, view, "raw" if raw else "unit")
+        weight = reflection_weight(*leaves[2:], OpticsSettings())
+        outputs = (rays.origins, rays.directions, rays.cosine, weight)
+        sum((each * each.detach().sin()).sum() for each in outputs).backward()
+        found.append([*(each.detach() for each in outputs), *(leaf.grad for leaf in leaves)])
     torch.set_num_threads(before)
-    assert all(torch.equal(one, other) for one, other in zip(*found, strict=True))
+    for other in found[1:]:
+        assert all(torch.equal(one, each) for one, each in zip(found[0], other, strict=True))

@@ -87,7 +87,7 @@ def test_not_a_number_is_handed_on_and_nothing_else_becomes_one(curve):
 
 
 @pytest.mark.parametrize("curve", [decoded, encoded])
-def test_threads_change_no_bit(curve):
+def test_threads_change_no_bit(isa, curve):
     given = 2 * torch.rand(3, 40_001, generator=torch.Generator().manual_seed(0))
     before, found = torch.get_num_threads(), []
     try:

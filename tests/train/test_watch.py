@@ -13,6 +13,7 @@ from training_cases import small_scene, small_schedule, small_trainer
 
 from rtgs.core.errors import RtgsError
 from rtgs.evaluate.metrics import psnr
+from rtgs.native import core
 from rtgs.scenes.scene import Scene
 from rtgs.train import clock, trainer
 from rtgs.train.clock import Clock, ElapsedTime
@@ -45,6 +46,7 @@ def turn_clock(monkeypatch: pytest.MonkeyPatch, now: list[float]) -> None:
     """Training's time is what ``now`` holds."""
     for name in ("monotonic", "process_time"):
         monkeypatch.setattr(clock.time, name, lambda: now[0])
+    monkeypatch.setattr(core, "seconds_awake", lambda: 0.0)
     monkeypatch.setattr(trainer, "Clock", lambda: Clock(now[0], now[0]))
 
 

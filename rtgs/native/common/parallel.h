@@ -1,5 +1,6 @@
 // Loops over the threads of the core (pool.h). A share is what one thread does: which items are in it depends on the
-// number of threads, so no sum over items may depend on the shares.
+// number of threads, so no sum over items may depend on the shares. One thread takes the same way as several: a body
+// that the compiler saw twice would round in two ways.
 #pragma once
 #include "common/memory.h"
 #include "common/pool.h"
@@ -13,7 +14,6 @@ namespace rtgs::RTGS_ISA {
 // work(part) for the parts 0 .. parts - 1, at once. In kernels only memory can run out: it is told at the end.
 template <class Work>
 inline void in_parts(int parts, const Work& work) {
-  if (parts <= 1) return work(0);
   struct Region {
     const Work& work;
     bool failed;
@@ -36,7 +36,6 @@ inline void in_parts(int parts, const Work& work) {
 // work(begin, end) of 0 .. count - 1, a share for each thread.
 template <class Work>
 inline void in_shares(int threads, int64_t count, const Work& work) {
-  if (threads <= 1) return work(int64_t(0), count);
   in_parts(threads, [&](int part) { work(count * part / threads, count * (part + 1) / threads); });
 }
 

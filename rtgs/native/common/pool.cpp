@@ -1,8 +1,12 @@
 #include "common/pool.h"
 
+#include "common/threads.h"
+
 #include <pthread.h>
+#include <signal.h>
 #include <unistd.h>
 
+#include <algorithm>
 #include <atomic>
 #include <chrono>
 #include <condition_variable>
@@ -36,7 +40,7 @@ void pause() {
 #endif
 }
 
-int cores() {
+int cores() {  // that this process may use
 #if defined(__linux__)
   cpu_set_t allowed;
   if (sched_getaffinity(0, sizeof allowed, &allowed) == 0) return CPU_COUNT(&allowed);
@@ -53,12 +57,13 @@ int64_t worked() {  // ns that this thread has run
 
 // Whether threads may wait awake: not for a while after one of them was interrupted.
 std::atomic<int64_t> calm_until{0}, calm{kLeastCalm};
+std::atomic<int64_t> spent_awake{0};
 
 void calm_down(int64_t time) {
   const int64_t until = calm_until.load(std::memory_order_relaxed), before = calm.load(std::memory_order_relaxed);
   const bool again = time - until < 4 * before;
   const bool longer = again && time >= until;  // not twice for what the same while saw
-  const int64_t next = !again ? kLeastCalm : longer && 2 * before <= kMostCalm ? 2 * before : before;
+  const int64_t next = !again ? kLeastCalm : longer ? std::min(2 * before, kMostCalm) : before;
   calm.store(next, std::memory_order_relaxed);
   calm_until.store(time + next, std::memory_order_relaxed);
 }
@@ -74,9 +79,10 @@ class Waiting {
     wake_.wait(lock, done);
     --sleepers_;
   }
-  // After what `done` looks at has changed.
+  // After what `done` looks at has changed: to `most` of those who wait, first to the awake.
   void tell(int most) {
-    if (sleepers_ == 0) return;
+    most -= awake_.load();
+    if (sleepers_ == 0 || most <= 0) return;
     std::lock_guard<std::mutex> lock(mutex_);
     if (most >= sleepers_) wake_.notify_all();
     else
@@ -86,27 +92,28 @@ class Waiting {
  private:
   template <class Done>
   bool awake(const Done& done) {
-    int64_t last = now();
-    if (last < calm_until.load(std::memory_order_relaxed)) return done();
-    const int64_t end = last + kAwake;
-    while (last < end) {
-      for (int k = 0; k < kPauses; ++k) {
-        if (done()) return true;
+    const int64_t began = now();
+    if (began < calm_until.load(std::memory_order_relaxed)) return done();
+    ++awake_;
+    int64_t last = began;
+    bool found = false;
+    while (!found && last < began + kAwake && last >= calm_until.load(std::memory_order_relaxed)) {
+      for (int k = 0; k < kPauses && !found; ++k) {
+        found = done();
         pause();
       }
       const int64_t time = now();
-      if (time - last > kInterrupted) {
-        calm_down(time);
-        return done();
-      }
+      if (time - last > kInterrupted) calm_down(time);
+      else spent_awake.fetch_add(time - last, std::memory_order_relaxed);
       last = time;
     }
-    return done();
+    --awake_;
+    return found || done();
   }
 
   std::mutex mutex_;
   std::condition_variable wake_;
-  std::atomic<int> sleepers_{0};
+  std::atomic<int> sleepers_{0}, awake_{0};
 };
 
 // Number of the job, its parts, and the next of them: in one word, so that a thread that takes a part knows of which job.
@@ -115,6 +122,7 @@ struct Ticket {
   uint32_t job() const { return uint32_t(word >> 32); }
   int parts() const { return int(word >> 16 & 0xffff); }
   int next() const { return int(word & 0xffff); }
+  static_assert(2 * kMostThreads < 0xffff);  // a draw in vain or two for each thread
   static uint64_t first(uint32_t job, int parts) { return uint64_t(job) << 32 | uint64_t(parts) << 16; }
 };
 
@@ -133,8 +141,11 @@ class Pool {
  private:
   // Threads never end: with the process. More than cores bring nothing.
   void hire(int wanted) {
-    static const int most = cores() - 1;
-    if (wanted > most) wanted = most;
+    if (wanted > most_) wanted = most_;
+    sigset_t all, before;
+    sigfillset(&all);
+    if (hired_ < wanted) pthread_sigmask(SIG_SETMASK, &all, &before);  // signals are for the threads of Python
+    else return;
     for (; hired_ < wanted; ++hired_) {
       pthread_attr_t attributes;
       pthread_t thread;
@@ -143,8 +154,12 @@ class Pool {
       pthread_attr_setdetachstate(&attributes, PTHREAD_CREATE_DETACHED);
       const int failed = pthread_create(&thread, &attributes, serve, this);
       pthread_attr_destroy(&attributes);
-      if (failed) return;  // the parts are done all the same
+      if (failed) {  // the parts are done all the same
+        most_ = hired_;
+        break;
+      }
     }
+    pthread_sigmask(SIG_SETMASK, &before, nullptr);
   }
   static void* serve(void* pool) {
     static_cast<Pool*>(pool)->serve_forever();
@@ -163,12 +178,12 @@ class Pool {
     if (time - began - (worked() - before) > kInterrupted) calm_down(time);
   }
 
-  std::atomic<uint64_t> tickets_{0};
-  std::atomic<int> left_{0};
+  alignas(64) std::atomic<uint64_t> tickets_{0};  // idle threads look at it all the time
+  alignas(64) std::atomic<int> left_{0};
   PartOfWork work_ = nullptr;
   void* context_ = nullptr;
   uint32_t jobs_ = 0;
-  int hired_ = 0;
+  int hired_ = 0, most_ = cores() - 1;
   Waiting idle_, ended_;
 };
 
@@ -200,10 +215,6 @@ void run_parts(int parts, PartOfWork work, void* context) {
   busy.store(false);
 }
 
-void forget_pool() {
-  pool = new Pool;
-  busy = false;
-  inside = false;
-}
+int64_t time_awake() { return spent_awake.load(std::memory_order_relaxed); }
 
 }  // namespace rtgs

@@ -2,8 +2,8 @@
 //
 // Waking a sleeping thread costs some 50 us, and a step of training has a hundred parallel parts. So a thread that has
 // nothing to do looks for work for kAwake before it sleeps. Where the machine has other work, threads that wait awake
-// take the time of those that work: a thread that finds itself interrupted while it waits sends all to sleep at once,
-// for a while that doubles each time.
+// take the time of those that work: a thread that finds itself interrupted sends all to sleep, for a while that doubles
+// where that goes on.
 #pragma once
 #include <cstdint>
 
@@ -16,7 +16,7 @@ using PartOfWork = void (*)(void* context, int part);
 // thread, or in a part of the pool itself, all parts run here, one after the other.
 void run_parts(int parts, PartOfWork work, void* context);
 
-// In a forked child, whose threads stayed with the parent.
-void forget_pool();
+// CPU time, ns, that all threads of the process have spent waiting awake.
+int64_t time_awake();
 
 }  // namespace rtgs

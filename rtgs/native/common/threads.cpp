@@ -15,10 +15,7 @@ namespace {
 
 std::atomic<bool> used_several{false}, left_behind{false};
 
-void in_forked_child() {
-  left_behind = used_several.load();
-  forget_pool();
-}
+void in_forked_child() { left_behind = used_several.load(); }
 
 }  // namespace
 
@@ -31,7 +28,9 @@ int checked_threads(int threads) {
   return threads;
 }
 
-void bind_threads(nb::module_&) {
+void bind_threads(nb::module_& module) {
+  module.def("seconds_awake", [] { return double(time_awake()) * 1e-9; },
+             "CPU seconds that the threads of the core have spent waiting awake for work.");
 #if defined(__unix__) || defined(__APPLE__)
   pthread_atfork(nullptr, nullptr, in_forked_child);
 #endif

@@ -77,21 +77,20 @@ void project_backward(const ProjectBackwardArgs& args) {
   const RecordLayout& layout = args.gaussians.layout;
   const GaussianArrays& in = args.inputs;
   const GaussianGradients& out = args.out;
-  in_shares(args.threads, (in.count + kLanes - 1) / kLanes, [&](int64_t begin, int64_t end) {
-    for (int64_t group = begin; group < end; ++group) {
-      const GradientRows rows(args, group * kLanes);
-      const SurfelGeometry g = surfel_geometry(args.camera, in, rows.first);
-      ParameterGradients p = chain_rule(args.camera, g, layout, rows);
-      if (args.saturate) saturate(p);
-      rows.write(out.means, p.mean);
-      rows.write(out.tangent_u, p.tangent_u);
-      rows.write(out.tangent_v, p.tangent_v);
-      rows.write<2>(out.scales, {p.scale_u, p.scale_v});
-      if (out.scales) mend_wide_scales(args, rows);
-      rows.write<1>(out.opacities, {p.opacity});
-      rows.write<2>(out.screen_probe, {p.probe_x, p.probe_y});
-      rows.write_features(out.features, in.channels, kGradChannels);
-    }
+  const int64_t groups = (in.count + kLanes - 1) / kLanes;
+  each_in_shares(args.threads, groups, [&](int64_t group) {
+    const GradientRows rows(args, group * kLanes);
+    const SurfelGeometry g = surfel_geometry(args.camera, in, rows.first);
+    ParameterGradients p = chain_rule(args.camera, g, layout, rows);
+    if (args.saturate) saturate(p);
+    rows.write(out.means, p.mean);
+    rows.write(out.tangent_u, p.tangent_u);
+    rows.write(out.tangent_v, p.tangent_v);
+    rows.write<2>(out.scales, {p.scale_u, p.scale_v});
+    if (out.scales) mend_wide_scales(args, rows);
+    rows.write<1>(out.opacities, {p.opacity});
+    rows.write<2>(out.screen_probe, {p.probe_x, p.probe_y});
+    rows.write_features(out.features, in.channels, kGradChannels);
   });
 }
 
