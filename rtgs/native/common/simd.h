@@ -228,12 +228,22 @@ static inline vint load_short(const uint16_t* p) {
 // Lane k = p[k * stride]: one component of kLanes consecutive rows.
 static inline vfloat load_strided(const float* p, int stride) { return gather(p, truncate(lane_numbers()) * stride); }
 
+// The value, of which fast-math may not reason how it came about.
+static inline vfloat as_rounded(vfloat a) {
+#if defined(__clang__)
+  return __arithmetic_fence(a);
+#else
+  return __builtin_assoc_barrier(a);
+#endif
+}
+
 // exp(a), relative error <= 3e-7 (portable: 4e-6 where |a| is large); a is clamped to [-87, 88].
 static inline vfloat exp(vfloat a) {
   constexpr float kLog2E = 1.44269504088896341f, kLog2ERest = 1.925963033500e-8f;
   a = clamp(a, -87.f, 88.f);
-  vfloat t = a * kLog2E, n = round(t);
-  vfloat f = (t - n) + fma(a, broadcast(kLog2E), -t) + a * kLog2ERest;  // with what rounding t and log2(e) lost
+  vfloat t = as_rounded(a * kLog2E), n = round(t);
+  vfloat lost = fma(a, broadcast(kLog2ERest), fma(a, broadcast(kLog2E), -t));  // by rounding t and log2(e)
+  vfloat f = as_rounded(t - n) + as_rounded(lost);
   vfloat p = broadcast(0.0001534581242594868f);        // minimax polynomial of 2^f on [-1/2, 1/2]
   p = fma(p, f, broadcast(0.0013399930903688073f));
   p = fma(p, f, broadcast(0.009618489071726799f));
