@@ -4,8 +4,8 @@ Compared are all stages of the four methods on ball_statue and toycar, preset ``
 of ``quick``. ``golden_checkpoints.json`` holds their digests by step and key. One instruction set, one PyTorch and
 processors of one maker made them; on others, bits differ, and the test is skipped. A stage that gets a new version gets
 new keys, and keeps its digests here where its bits are the old ones. When a recipe or a result is meant to change, its
-lines go. Those of rtgs and of toycar were recorded anew when the core got threads of its own: the compiler then took one
-sum of the photometric loss in another order.
+lines go. Those of rtgs and of toycar were recorded anew when the core got threads of its own: the compiler then took
+one sum of the photometric loss in another order.
 
 Where the captures themselves are others, all keys are. ``RTGS_ROOT=FOLDER python -m
 tests.pipelines.steps.test_same_checkpoints [METHOD ...]`` then records the digests of this code and this machine, after
