@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING
@@ -30,6 +29,7 @@ from lab.late_levers import (
     swapped,
 )
 from lab.training_choices import judged_in_training
+from rtgs.core.work_time import work_time
 from rtgs.train.method import Mode
 from rtgs.train.schedule import densify_end
 
@@ -187,9 +187,9 @@ class Session:
             seconds += trainer.run().cpu_seconds
             order, step = trainer._order.state(), stop
             if stop < self.total:
-                began = time.process_time()
+                began = work_time()
                 consolidate(model, self.unseen.train, step, prune)
-                seconds += time.process_time() - began
+                seconds += work_time() - began
         return model, seconds
 
     def score(self, model: Model, lever: str, seconds: float) -> LeverScore:

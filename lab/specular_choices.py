@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from hashlib import sha256
@@ -22,6 +21,8 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
+
+from rtgs.core.work_time import work_time
 
 if TYPE_CHECKING:
     from rtgs.config.schema import RunConfig
@@ -166,10 +167,10 @@ def trained(config: RunConfig, scene: Scene, seed: int, first: dict[str, Tensor]
     if first is not None and len(stages) > 1:
         method.load(first)
         stages = stages[1:]
-    began = time.process_time()
+    began = work_time()
     for stage in stages:
         Trainer(method, scene, seed=seed, stage=stage).run()
-    return method, time.process_time() - began
+    return method, work_time() - began
 
 
 def first_stage(config: RunConfig, setting: Setting, seed: int) -> dict[str, Tensor] | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from benchmarks.common.machine import peak_memory_mb
+from rtgs.core.work_time import work_time
 
 if TYPE_CHECKING:
     from rtgs.methods import Method
@@ -87,9 +87,9 @@ def train_run(
     reset_peak_memory()
     method = create_method(config.method, scene, config.schedule, generator_for(config.seed, "initialise"))
     unseen = replace(scene, test=())  # no test views: their time is not training
-    start = time.process_time()
+    start = work_time()
     summaries = [Trainer(method, unseen, seed=config.seed, stage=stage).run() for stage in method.stages]
-    cpu_seconds = time.process_time() - start
+    cpu_seconds = work_time() - start
     wall_seconds = sum(summary.seconds for summary in summaries)
     return TrainedRun(method, scene, summaries[-1], cpu_seconds, wall_seconds, run_peak_memory_mb())
 

@@ -15,9 +15,7 @@ from __future__ import annotations
 
 import os
 
-os.environ.setdefault(
-    "OMP_WAIT_POLICY", "passive"
-)  # a waiting thread of torch must not count as working; before it loads
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # torch's threads: waiting is no work; before it loads
 
 import argparse
 import importlib.util

@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import json
 import platform
-import time
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -22,6 +21,7 @@ from torch import Tensor
 
 from benchmarks.common.yardstick_scene import yardstick_case
 from rtgs.core.cameras import Camera
+from rtgs.core.work_time import work_time
 from rtgs.gaussians.settings import OptimizerSettings
 from rtgs.gaussians.surfels import ActivatedGaussians
 from rtgs.methods import create_method
@@ -161,9 +161,9 @@ def lowest_ms(functions: dict[str, Callable[[], object]], rounds: int) -> dict[s
     lowest = dict.fromkeys(functions, float("inf"))
     for _ in range(rounds):
         for name, function in functions.items():
-            start = time.process_time()
+            start = work_time()
             function()
-            lowest[name] = min(lowest[name], 1e3 * (time.process_time() - start))
+            lowest[name] = min(lowest[name], 1e3 * (work_time() - start))
     return lowest
 
 

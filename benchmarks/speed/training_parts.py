@@ -13,9 +13,7 @@ from __future__ import annotations
 
 import os
 
-os.environ.setdefault(
-    "OMP_WAIT_POLICY", "passive"
-)  # a waiting thread of torch must not count as working; before it loads
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # torch's threads: waiting is no work; before it loads
 
 import argparse
 import json
@@ -31,7 +29,7 @@ import torch
 
 from benchmarks.common.machine import machine
 from benchmarks.common.training_runs import schedule_overrides
-from rtgs.native.threads import work_time
+from rtgs.core.work_time import work_time
 
 if TYPE_CHECKING:
     from rtgs.config.schema import RunConfig

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from statistics import median
@@ -21,6 +20,7 @@ import torch
 from benchmarks.common.machine import machine
 from benchmarks.common.training_runs import schedule_overrides
 from rtgs.config.compose import compose
+from rtgs.core.work_time import work_time
 from rtgs.mesh.container import ObjectMesh
 from rtgs.mesh.triangles import TriangleMesh
 from rtgs.methods import Mode, Stage, create_method
@@ -87,9 +87,9 @@ def one_step(method: Model, view: View, step: int) -> None:
 
 
 def cpu_milliseconds(work: Callable[[], None]) -> float:
-    start = time.process_time()
+    start = work_time()
     work()
-    return 1000 * (time.process_time() - start)
+    return 1000 * (work_time() - start)
 
 
 def main() -> None:

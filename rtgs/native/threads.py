@@ -7,14 +7,11 @@ on two threads they take longer than on one (docs/lab/benchmarks.md).
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 
 import torch
-
-from rtgs.native import core
 
 SERIAL_PIXELS = 1 << 18  # of a picture, up to which waking threads costs torch's operations more than it brings
 
@@ -24,12 +21,6 @@ _kernels: ContextVar[int | None] = ContextVar("kernels", default=None)  # None: 
 def threads() -> int:
     """Of every kernel: as many as torch has, or had before :func:`serial_torch`."""
     return _kernels.get() or torch.get_num_threads()
-
-
-def work_time() -> float:
-    """CPU seconds of this process, all threads, less what the core's spent waiting awake for work: that depends on what
-    else the machine does."""
-    return time.process_time() - core.seconds_awake()
 
 
 @contextmanager

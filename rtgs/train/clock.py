@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, field
 
-from rtgs.native.threads import work_time
+from rtgs.core.work_time import work_time
 
 
 @dataclass(frozen=True)

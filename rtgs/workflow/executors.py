@@ -15,6 +15,7 @@ from filelock import Timeout
 
 from rtgs.core.credentials import redact
 from rtgs.core.recipe import flatten
+from rtgs.core.work_time import work_time
 from rtgs.track import NullTracking, RunInfo, Tracking
 from rtgs.track.protocol import STEP_TAG
 from rtgs.workflow.artifacts import Artifacts
@@ -177,7 +178,7 @@ class InlineExecutor:
         inputs = {other.name: self.store.folder(other) for other in step.upstream}
         tags = {f"rtgs.upstream.{other.name}": other.fingerprint for other in step.upstream}
         info = RunInfo(STEPS_EXPERIMENT, step.label, step.fingerprint, {STEP_TAG: step.name, **tags})
-        start, cpu = time.perf_counter(), time.process_time()
+        start, cpu = time.perf_counter(), work_time()
         try:
             with self.tracking.run(info) as tracker:
                 tracker.params({key: _scalar(value) for key, value in flatten(step.recipe).items()})
@@ -185,7 +186,7 @@ class InlineExecutor:
                 shared = (self.artifacts, self.quiet, step.tools, self.onlooker)
                 context = StepContext(inputs, attempt, partial, messages, tracker, executed, *shared)
                 step.run(step.params, context)
-                took = (time.perf_counter() - start, time.process_time() - cpu)
+                took = (time.perf_counter() - start, work_time() - cpu)
                 return self.store.publish(step, attempt, *took)
         except Exception as error:
             raise StepFailed(step, error) from error

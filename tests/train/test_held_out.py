@@ -60,7 +60,7 @@ def test_a_look_is_no_time_of_training(monkeypatch):
     now = [100.0]
     monkeypatch.setattr("rtgs.train.clock.time.monotonic", lambda: now[0])
     monkeypatch.setattr("rtgs.train.clock.time.process_time", lambda: now[0] / 2)
-    monkeypatch.setattr("rtgs.native.threads.core.seconds_awake", lambda: 0.0)
+    monkeypatch.setattr("rtgs.native.core.seconds_awake", lambda: 0.0)
     clock = Clock(now[0], now[0] / 2)
     now[0] += 4
     before = clock.elapsed()

@@ -27,7 +27,7 @@ def test_looks_beyond_the_checkpoint_are_forgotten(checkpoint, tmp_path: Path, m
     now, pace = [0.0], 2.0
     for name in ("monotonic", "process_time"):
         monkeypatch.setattr(clock.time, name, lambda: now[0])
-    monkeypatch.setattr("rtgs.native.threads.core.seconds_awake", lambda: 0.0)
+    monkeypatch.setattr("rtgs.native.core.seconds_awake", lambda: 0.0)
     monkeypatch.setattr(trainer, "Clock", lambda: Clock(now[0], now[0]))
     step = trainer.Trainer._train_step
 

@@ -1,0 +1,13 @@
+"""CPU time of work."""
+
+from __future__ import annotations
+
+import sys
+import time
+
+
+def work_time() -> float:
+    """CPU seconds of this process, all threads, less what those of the native core (where it is loaded) spent waiting
+    awake for work: that depends on what else the machine does."""
+    core = sys.modules.get("rtgs.native._core")
+    return time.process_time() - (core.seconds_awake() if core is not None else 0.0)
