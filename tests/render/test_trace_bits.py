@@ -17,7 +17,7 @@ from .trace_scenes import NAMES, OUTPUTS, TraceTensors, all_outputs, output
 
 @pytest.mark.parametrize("size", [0.05, 0.5])
 def test_bits_do_not_depend_on_the_number_of_threads(isa: str, size: float):
-    scene = native_trace_scene(700, 901, 5, size=size)
+    scene = native_trace_scene(700, 2901, 5, size=size)  # several groups of packets
     expected = everything(scene)
     for threads in (2, 5):
         torch.set_num_threads(threads)

@@ -136,8 +136,7 @@ class Tracing {
     if (args.surfel_gradients) args.rows = m.rows.reserve(count * args.row_stride + 64);
     args.touched = m.touched.reserve(count + 1);
     std::fill_n(args.touched, count, uint8_t(0));
-    args.owners = m.owners.reserve(count + 1);
-    args.range_starts = m.ranges.reserve(options_.threads + 1);
+    args.groups = m.groups.reserve(packets_ + 1);
     RTGS_CALL(isa_, trace_backward, args);
     if (args.surfel_gradients) RTGS_CALL(isa_, trace_surfel_gradients, args, m.slots.get(), out, !poisoned);
   }

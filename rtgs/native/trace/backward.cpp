@@ -9,8 +9,9 @@ namespace {
 
 class PacketBackward {
  public:
-  PacketBackward(const TraceBackwardArgs& args, TraceWorkspace& work, const ColorMasks& masks, int64_t packet, int part)
-      : args_(args), work_(work), tape_(args.tapes[packet]), part_(part), rays_(args.rays, packet),
+  PacketBackward(const TraceBackwardArgs& args, TraceWorkspace& work, GroupRows& rows, const ColorMasks& masks,
+                 int64_t packet)
+      : args_(args), work_(work), group_(rows), tape_(args.tapes[packet]), rays_(args.rays, packet),
         ray_rows_(args.surfels, masks) {
     for (int k = 0; k < 3; ++k) to_origin_[k] = to_direction_[k] = broadcast(0.f);
   }
@@ -37,15 +38,14 @@ class PacketBackward {
 
   void add_surfels();
   void geometry_sums(const float* s, const PlaneHit& hit, int32_t place, vmask met, vfloat w, vfloat* sums);
-  float* destination(int32_t slot, bool& adds);
   void write_rays();
 
   const float* record(int32_t slot) const { return args_.records + int64_t(kTraceFields) * slot; }
 
   const TraceBackwardArgs& args_;
   TraceWorkspace& work_;
+  GroupRows& group_;
   const PacketTape& tape_;
-  const int part_;
   const PacketRays rays_;
 
   vfloat to_features_[32], to_colors_[3], to_normal_[3], to_depth_ = broadcast(0.f);
@@ -209,27 +209,8 @@ inline void PacketBackward::geometry_sums(const float* s, const PlaneHit& hit, i
   sums[kTraceGradLogAlpha] = log_alpha;
 }
 
-// Where the sums of this packet go: the surfel's row, or the end of the waiting rows.
-inline float* PacketBackward::destination(int32_t slot, bool& adds) {
-  if (args_.options.threads > 1 && args_.owners[slot] != part_) {
-    const int64_t waiting = work_.waiting++;
-    work_.waiting_slots.reserve(waiting + 1);
-    work_.waiting_rows.reserve((waiting + 1) * args_.row_stride);
-    work_.waiting_slots[waiting] = slot;
-    adds = false;
-    return work_.waiting_rows.data + waiting * args_.row_stride;
-  }
-  adds = args_.touched[slot];
-  args_.touched[slot] = 1;
-  return args_.rows + int64_t(slot) * args_.row_stride;
-}
-
 void PacketBackward::add_surfels() {
   for (int k = 0; k < tape_.surfels; ++k) {
-    if (args_.surfel_gradients && k + kTracePrefetch < tape_.surfels) {
-      const float* row = args_.rows + int64_t(tape_.slots[k + kTracePrefetch]) * args_.row_stride;
-      for (int c = 0; c < ray_rows_.layout().floats; c += 16) __builtin_prefetch(row + c, 1);
-    }
     const int32_t slot = tape_.slots[k], place = tape_.places[k];
     const float* s = record(slot);
     const PlaneHit hit = plane_hit(s, rays_);
@@ -241,7 +222,7 @@ void PacketBackward::add_surfels() {
     const SurfelHits hits = surfel_hits(met, w, work_.clamped[k]);
     if (args_.surfel_gradients) {
       bool adds;
-      float* out = destination(slot, adds);
+      float* out = group_.of(slot, adds);
       for (int c = 0; c < kTraceGradChannels; c += kLanes) put(out + c, settled(sums_of<>(sums + c)), adds);
       if (args_.ray_gradients && !args_.options.last_sh && ray_rows_.sum_both(hits, tape_.ids[k], out, adds)) continue;
       ray_rows_.sum_hits(hits, out, adds);
@@ -292,15 +273,27 @@ int first_coefficient(const TraceSurfels& surfels) { return kTraceGradChannels +
 
 void trace_backward(const TraceBackwardArgs& args) {
   const int threads = args.options.threads;
-  split_work(args);
-  for (int part = 0; part < threads; ++part) workspace_of(args.workspaces, part).waiting = 0;
-  in_parts(threads, [&](int part) {
+  const int64_t packets = packet_count(args.rays), groups = (packets + kGroup - 1) / kGroup;
+  const int64_t surfels = args.surfels.arrays.count;
+  for (int part = 0; part < threads; ++part) workspace_of(args.workspaces, part).summed = 0;
+  in_turns(threads, groups, 1, [&](int part, Turns& turns) {
     TraceWorkspace& work = workspace_of(args.workspaces, part);
     const ColorMasks masks(args.surfels.feature_count());
-    for (int64_t packet = args.range_starts[part]; packet < args.range_starts[part + 1]; ++packet)
-      PacketBackward(args, work, masks, packet, part).run();
+    for (int64_t group, after; turns.next(group, after);) {
+      GroupRows rows(work, surfels, args.row_stride);
+      const int64_t end = after * kGroup < packets ? after * kGroup : packets;
+      for (int64_t packet = group * kGroup; packet < end; ++packet)
+        PacketBackward(args, work, rows, masks, packet).run();
+      args.groups[group] = rows.done(part);
+      if (threads > 1) continue;
+      add_group(args, args.groups[group], 0, surfels);
+      work.summed = 0;
+    }
   });
-  if (threads > 1 && args.surfel_gradients) add_waiting(args);
+  if (threads == 1) return;
+  in_shares(threads, surfels, [&](int64_t begin, int64_t end) {
+    for (int64_t group = 0; group < groups; ++group) add_group(args, args.groups[group], begin, end);
+  });
 }
 
 }  // namespace rtgs::RTGS_ISA

@@ -119,15 +119,15 @@ struct TraceWorkspace {
   Growing<uint64_t> long_keys, spare_keys;
   // Of the backward pass.
   Growing<uint64_t> clamped;    // by surfel met: colours at zero, a bit per ray, 16 bits apart per channel
-  Growing<float> waiting_rows;
-  Growing<int32_t> waiting_slots;
-  int64_t waiting;
+  Growing<float> summed_rows;     // of the groups of packets, one after the other (rows.h)
+  Growing<int32_t> summed_slots, places;  // of each row its surfel; of each surfel its last row
+  int64_t summed;
 
   void release() {
     pending.release(), t.release(), exponents.release(), weights.release(), to_weight.release(), slots.release();
     columns.release(), sorted_places.release(), sorted_t.release(), rows.release(), keys.release();
     met_ids.release(), met_slots.release(), met_places.release(), long_keys.release(), spare_keys.release();
-    clamped.release(), waiting_rows.release(), waiting_slots.release();
+    clamped.release(), summed_rows.release(), summed_slots.release(), places.release();
   }
 };
 

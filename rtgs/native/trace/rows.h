@@ -1,4 +1,4 @@
-// Gradient rows of the tracer's backward pass: their layout, and how threads share them.
+// Gradient rows of the tracer's backward pass: their layout, and in which order they are summed.
 #pragma once
 #include "common/parallel.h"
 #include "trace/packet.h"
@@ -16,52 +16,51 @@ struct RowLayout {
         floats(kTraceGradChannels + channels + coefficients) {}
 };
 
-// ---- threads -----------------------------------------------------------------------------------------------------
-// Ranges of about equal work: range_starts. And to which range each surfel's row belongs.
-static inline void split_work(const TraceBackwardArgs& args) {
-  const int64_t packets = packet_count(args.rays);
-  const int threads = args.options.threads;
-  int64_t total = 0, done = 0;
-  const auto work = [&](int64_t p) { return int64_t(args.tapes[p].hits) + 8 * args.tapes[p].surfels; };
-  for (int64_t packet = 0; packet < packets; ++packet) total += work(packet);
-  int range = 0;
-  for (int64_t packet = 0; packet < packets; ++packet) {
-    while (range < threads && done * threads >= total * range) args.range_starts[range++] = packet;
-    done += work(packet);
-  }
-  while (range <= threads) args.range_starts[range++] = packets;
-  if (threads == 1 || !args.surfel_gradients) return;
-  memset(args.owners, 0x7f, size_t(args.surfels.arrays.count) * sizeof(int32_t));
-  in_parts(threads, [&](int part) {
-    for (int64_t packet = args.range_starts[part]; packet < args.range_starts[part + 1]; ++packet)
-      for (int32_t k = 0; k < args.tapes[packet].surfels; ++k) {
-        int32_t* owner = args.owners + args.tapes[packet].slots[k];
-        int32_t before = __atomic_load_n(owner, __ATOMIC_RELAXED);
-        while (part < before &&
-               !__atomic_compare_exchange_n(owner, &before, part, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {
-        }
-      }
-  });
-}
+// ---- groups ------------------------------------------------------------------------------------------------------
+constexpr int64_t kGroup = 32;  // packets; they meet the same surfels, so their rows are few and stay in the cache
 
-// Each thread takes a share of the slots, so that the order of additions to a row is that of the packets.
-static inline void add_waiting(const TraceBackwardArgs& args) {
-  const int threads = args.options.threads;
-  const int64_t count = args.surfels.arrays.count;
-  const int floats = RowLayout(args.surfels).floats;
-  in_parts(threads, [&](int part) {
-    const int64_t begin = count * part / threads, end = count * (part + 1) / threads;
-    for (int range = 1; range < threads; ++range) {
-      TraceWorkspace& from = workspace_of(args.workspaces, range);
-      for (int64_t k = 0; k < from.waiting; ++k) {
-        const int64_t slot = from.waiting_slots[k];
-        if (slot < begin || slot >= end) continue;
-        const float* waiting = from.waiting_rows.data + args.row_stride * k;
-        float* row = args.rows + args.row_stride * slot;
-        for (int c = 0; c < floats; c += kLanes) store(row + c, load(row + c) + load(waiting + c));
-      }
+// The rows of one group of packets, at the end of those of its thread.
+class GroupRows {
+ public:
+  GroupRows(TraceWorkspace& work, int64_t surfels, int stride) : work_(work), stride_(stride), first_(work.summed) {
+    const int64_t before = work.places.capacity;
+    work.places.reserve(surfels);
+    if (work.places.capacity > before)
+      memset(work.places.data + before, 0, size_t(work.places.capacity - before) * sizeof(int32_t));
+  }
+  // Of the surfel; adds: whether the group has summed anything into it.
+  float* of(int32_t slot, bool& adds) {
+    int32_t& place = work_.places[slot];  // of an earlier group or call where it does not hold the slot
+    adds = place >= first_ && place < work_.summed && work_.summed_slots[place] == slot;
+    if (!adds) {
+      place = int32_t(work_.summed);
+      work_.summed_slots.reserve(place + 1);
+      work_.summed_rows.reserve(int64_t(place + 1) * stride_);
+      work_.summed_slots[work_.summed++] = slot;
     }
-  });
+    return work_.summed_rows.data + int64_t(place) * stride_;
+  }
+  TraceGroup done(int part) const { return {part, first_, work_.summed}; }
+
+ private:
+  TraceWorkspace& work_;
+  const int stride_;
+  const int64_t first_;
+};
+
+// Adds what a group has for the surfels with slots begin .. end - 1 to their rows.
+static inline void add_group(const TraceBackwardArgs& args, const TraceGroup& group, int64_t begin, int64_t end) {
+  const TraceWorkspace& from = workspace_of(args.workspaces, group.part);
+  const int floats = RowLayout(args.surfels).floats;
+  for (int64_t k = group.begin; k < group.end; ++k) {
+    const int64_t slot = from.summed_slots.data[k];
+    if (slot < begin || slot >= end) continue;
+    const float* sums = from.summed_rows.data + args.row_stride * k;
+    float* row = args.rows + args.row_stride * slot;
+    const bool adds = args.touched[slot];
+    args.touched[slot] = 1;
+    for (int c = 0; c < floats; c += kLanes) store(row + c, adds ? load(row + c) + load(sums + c) : load(sums + c));
+  }
 }
 
 }  // namespace rtgs::RTGS_ISA

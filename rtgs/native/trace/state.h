@@ -28,11 +28,12 @@ struct TraceMemory {
   Buffer<float> records;
   Buffer<float> rows;  // one gradient row per slot
   Buffer<uint8_t> touched;
-  Buffer<int32_t> slots, order, owners;
+  Buffer<int32_t> slots, order;
   Buffer<float> coordinates;  // of the rays, to order them
   Buffer<DepthKey> keys, spare_keys;
   Buffer<PacketTape> tapes;
-  Buffer<int64_t> ranges, scratch;
+  Buffer<TraceGroup> groups;
+  Buffer<int64_t> scratch;
   std::vector<ArenaBlocks> tape_blocks;  // one per thread
   std::vector<void*> workspaces;                         // likewise
 

@@ -92,6 +92,12 @@ struct TraceForwardArgs {
   int64_t hits;           // result
 };
 
+// Where a group of packets has its gradient rows: in which thread's workspace, and which of them.
+struct TraceGroup {
+  int part;
+  int64_t begin, end;
+};
+
 struct TraceBackwardArgs {
   TraceSurfels surfels;
   TraceRays rays;
@@ -107,11 +113,9 @@ struct TraceBackwardArgs {
   bool surfel_gradients, ray_gradients;  // what is wanted: rows; out_origins and out_directions
   float *out_origins, *out_directions;
   int* poisoned;          // set to 1 when an upstream gradient is NaN or infinite
-  // Several threads: thread k takes the packets from range_starts[k] on. A row belongs to the first range that meets its
-  // surfel (owners); what later ranges have for it waits, in the order of packets, and is added at the end. So every row
-  // is summed in the order of packets, whatever the number of threads.
-  int64_t* range_starts;  // (threads + 1)
-  int32_t* owners;        // (N)
+  // Packets come in groups, whose sums are added in their order: so no bit depends on the number of threads. One thread
+  // adds those of each group at once, several when all groups are done.
+  TraceGroup* groups;     // (packets) at most
 };
 
 struct TraceGradients {  // null: not wanted
