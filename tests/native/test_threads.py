@@ -199,6 +199,45 @@ def test_a_child_forked_after_threads_were_used_renders_the_same_bits():
     assert raw == "0"
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="a limit on threads")
+def test_where_the_system_gives_no_thread_the_work_is_done_all_the_same():
+    done = subprocess.run([sys.executable, "-c", _NO_THREADS], capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == 0, (done.returncode, done.stderr[-2000:])
+    alone, refused, found = done.stdout.split()
+    assert refused == "refused"
+    assert found == alone
+
+
+# The limit does not bind root. torch's own threads, which it would end the process for, are not used.
+_NO_THREADS = """
+import hashlib, os, resource, threading
+import torch
+from rtgs.native.threads import serial_torch
+from tests.render.native_scene import SCENE_OPTIONS, native_scene
+
+def digest():
+    scene = native_scene(count=400, width=97, height=64, channels=3)
+    leaves = scene.leaves()
+    pixels = scene.render(SCENE_OPTIONS, leaves).features
+    with torch.autograd.set_multithreading_enabled(False):
+        found = [pixels.detach(), *torch.autograd.grad(pixels.square().sum(), leaves)]
+    return hashlib.sha256(b"".join(each.detach().numpy().tobytes() for each in found)).hexdigest()
+
+torch.set_num_threads(1)
+print(digest(), flush=True)
+if os.geteuid() == 0:
+    os.setgid(65534)
+    os.setuid(65534)
+resource.setrlimit(resource.RLIMIT_NPROC, (0, 0))
+try:
+    threading.Thread(target=print).start()
+except RuntimeError:
+    print("refused", flush=True)
+torch.set_num_threads(3)
+with serial_torch():
+    print(digest(), flush=True)
+"""
+
 # A child that waits for threads which only its parent has would wait for ever: the alarm ends it.
 _FORKS = """
 import hashlib, os, signal, sys
