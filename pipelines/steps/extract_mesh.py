@@ -222,18 +222,21 @@ def _median_depths(method: Method, step: int, scene: Scene) -> list[Tensor]:
     import torch
 
     from rtgs.methods import Mode, RenderOptions
+    from rtgs.methods.model import Model
     from rtgs.train.losses import surface_depth
 
     median = "median_depth" in method.maps
+    wanted = RenderOptions(depth=True, median_depth=median)
     depths = []
     for view in scene.train:
         if view.mask is None:
             depths.append(torch.zeros(view.camera.height, view.camera.width))
             continue
         with torch.no_grad():
-            buffers = method.render(
-                view.camera, step, Mode.EVALUATE, RenderOptions(depth=True, median_depth=median)
-            ).buffers
+            if isinstance(method, Model):
+                buffers = method.surface(view.camera, step, wanted)
+            else:
+                buffers = method.render(view.camera, step, Mode.EVALUATE, wanted).buffers
         assert buffers.depth is not None
         depth = surface_depth(buffers.depth, buffers.alpha, buffers.median_depth, 1.0 if median else 0.0)
         depths.append(torch.where(torch.isfinite(depth) & (buffers.alpha >= 0.5), depth, 0.0).float())

@@ -81,6 +81,12 @@ class MeshGuide:
         return self.mesh.vertices[self.mesh.faces[:, 0]].astype(np.float64)
 
     @cached_property
+    def box_corners(self) -> np.ndarray:
+        """(8, 3) float64: of the box around the mesh."""
+        low, high = self.mesh.vertices.min(0), self.mesh.vertices.max(0)
+        return np.stack(np.meshgrid(*np.stack((low, high), 1), indexing="ij"), -1).reshape(-1, 3).astype(np.float64)
+
+    @cached_property
     def _size(self) -> float:
         return float(np.abs(self.mesh.vertices).max())
 

@@ -10,6 +10,7 @@ contents of a cup) says nothing at all: the cup counts as closed, for its wall i
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,7 @@ from torch import Tensor
 from rtgs.mesh.guide import MeshGuide
 from rtgs.mesh.silhouettes import MaskView
 from rtgs.mesh.triangles import TriangleMesh
+from rtgs.native.threads import threads
 
 HIDDEN = 1e9  # instead of a distance: the view says nothing about the point
 _CHUNK = 1 << 16  # points
@@ -154,7 +156,8 @@ class MaskField:
         return np.concatenate([self._outvoting(torch.from_numpy(chunk), counts) for chunk in chunks], axis=1)
 
     def _outvoting(self, points: Tensor, counts: Sequence[int]) -> np.ndarray:
-        values = torch.stack([outline.distance(points) for outline in self.outlines])
+        with ThreadPoolExecutor(threads()) as workers:  # torch lets go of the interpreter while it computes
+            values = torch.stack(list(workers.map(lambda outline: outline.distance(points), self.outlines)))
         smallest = values.topk(max(counts) + 1, dim=0, largest=False, sorted=True).values
         seen, heard = torch.isfinite(values).sum(0), (values < HIDDEN).sum(0)
         ranks = [(k * heard) // len(values) for k in counts]

@@ -138,29 +138,30 @@ def silhouette_score(
 
 def silhouette(guide: MeshGuide, camera: Camera, stride: int = 1) -> np.ndarray:
     """(H', W') bool: pixels whose ray meets the mesh; every ``stride``-th, from the middle of the first block on."""
-    rays = camera.rays(torch.float32)
-    directions = rays.directions[stride // 2 :: stride, stride // 2 :: stride].numpy()
-    seen = np.zeros(directions.shape[:2], bool)
+    rows, columns = (np.arange(stride // 2, size, stride) for size in (camera.height, camera.width))
+    seen = np.zeros((len(rows), len(columns)), bool)
     framed = tuple(
         slice(max(low - stride // 2, 0) // stride, high // stride + 1) for low, high in _frame(guide, camera)
     )
-    ahead = directions[framed]
-    if ahead.size:
-        origins = np.broadcast_to(rays.origin.numpy(), ahead.shape).reshape(-1, 3)
-        seen[framed] = guide.meets(origins, ahead.reshape(-1, 3)).reshape(ahead.shape[:2])
+    rows, columns = rows[framed[0]], columns[framed[1]]
+    if rows.size and columns.size:
+        ahead = np.ones((len(rows), len(columns), 3))
+        ahead[..., 0] = (columns + 0.5 - camera.cx) / camera.fx
+        ahead[..., 1] = ((rows + 0.5 - camera.cy) / camera.fy)[:, None]
+        directions = (ahead.reshape(-1, 3) @ camera.rotation.double().numpy()).astype(np.float32)
+        origins = np.broadcast_to(camera.center.float().numpy(), directions.shape)
+        seen[framed] = guide.meets(origins, directions).reshape(ahead.shape[:2])
     return seen
 
 
 def _frame(guide: MeshGuide, camera: Camera) -> tuple[tuple[int, int], tuple[int, int]]:
     """First and last row, first and last column of the pixels in which the mesh may be seen."""
-    low, high = guide.mesh.vertices.min(0), guide.mesh.vertices.max(0)
-    corners = np.stack(np.meshgrid(*np.stack((low, high), 1), indexing="ij"), -1).reshape(-1, 3)
-    pixels, depth = camera.project(torch.from_numpy(corners).double())
-    if not bool((depth > 0).all()):
+    pixels, depth = (each.numpy() for each in camera.project(torch.from_numpy(guide.box_corners)))
+    size = np.array([camera.width, camera.height])
+    if not (depth > 0).all():
         return (0, camera.height), (0, camera.width)  # the box reaches behind the camera
-    size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
-    first, last = (torch.minimum(each.clamp_min(0), size) for each in (pixels.amin(0) - 1, pixels.amax(0) + 1))
-    (left, top), (right, bottom) = first.long().tolist(), last.ceil().long().tolist()
+    first, last = (np.clip(each, 0, size) for each in (pixels.min(0) - 1, pixels.max(0) + 1))
+    (left, top), (right, bottom) = first.astype(int).tolist(), np.ceil(last).astype(int).tolist()
     return (top, bottom), (left, right)
 
 

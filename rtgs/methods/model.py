@@ -34,6 +34,7 @@ from rtgs.train.terms import LossTerm, table_of
 if TYPE_CHECKING:
     from rtgs.light.cubemap import DirectionalLight
     from rtgs.methods.settings import MethodSettings
+    from rtgs.render.buffers import RasterBuffers
     from rtgs.scenes.scene import View
 
 NO_OPTIONS = RenderOptions()
@@ -166,10 +167,16 @@ class Model:
         RenderedView
             The image and its maps.
         """
-        frame = Frame(camera, step, mode, options, mask)
+        return self.seen(self._aimed(Frame(camera, step, mode, options, mask)))
+
+    def surface(self, camera: Camera, step: int, options: RenderOptions = NO_OPTIONS) -> RasterBuffers:
+        """The maps of the base set in the view that :meth:`render` renders; nothing is shaded."""
+        return self.rasterize(self._aimed(Frame(camera, step, Mode.EVALUATE, options))).buffers
+
+    def _aimed(self, frame: Frame) -> Frame:
         for part in self.parts.values():
             frame = part.aim(frame)
-        return self.seen(frame)
+        return frame
 
     def seen(self, frame: Frame) -> RenderedView:
         """A view that has been aimed, rendered; :meth:`render` aims it first."""
