@@ -5,7 +5,8 @@ of ``quick``. ``golden_checkpoints.json`` holds their digests by step and key. O
 processors of one maker made them; on others, bits differ, and the test is skipped. A stage that gets a new version gets
 new keys, and keeps its digests here where its bits are the old ones. When a recipe or a result is meant to change, its
 lines go. Those of rtgs and of toycar were recorded anew when the core got threads of its own: the compiler then took
-one sum of the photometric loss in another order.
+one sum of the photometric loss in another order; those of traced sets when gradients came to be summed by groups of
+packets.
 
 Where the captures themselves are others, all keys are. ``RTGS_ROOT=FOLDER python -m
 tests.pipelines.steps.test_same_checkpoints [METHOD ...]`` then records the digests of this code and this machine, after
