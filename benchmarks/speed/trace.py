@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import os
 
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # torch's threads: waiting is no work; before it loads
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch loads: its waiting threads do no work
 
 import argparse
 import ctypes

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from rtgs.mesh.choose import Choice
     from rtgs.mesh.triangles import TriangleMesh
     from rtgs.mesh.tsdf import DepthView, MeshResult
-    from rtgs.methods import Method
+    from rtgs.methods.model import Model
     from rtgs.scenes.scene import Scene
 
 MESH_FILE = "mesh.ply"
@@ -99,7 +99,7 @@ def why_absent(folder: Path) -> str:
     return MeshRecord.read(folder).absent or ""
 
 
-def _scene_mesh(method: Method, step: int, scene: Scene, params: ExtractMeshParams, context: StepContext) -> None:
+def _scene_mesh(method: Model, step: int, scene: Scene, params: ExtractMeshParams, context: StepContext) -> None:
     """Of everything, or of everything masked."""
     from rtgs.mesh.container import ObjectMesh, write_object_mesh
     from rtgs.mesh.triangles import write_mesh_ply
@@ -121,7 +121,7 @@ def _scene_mesh(method: Method, step: int, scene: Scene, params: ExtractMeshPara
     context.log.info("mesh of %d triangles in %d pieces, voxel %.4g", len(result.mesh.faces), result.kept, result.voxel)
 
 
-def _object_mesh(method: Method, step: int, scene: Scene, params: ExtractMeshParams, context: StepContext) -> None:
+def _object_mesh(method: Model, step: int, scene: Scene, params: ExtractMeshParams, context: StepContext) -> None:
     """Of the transparent object: hull, pane, TSDF or a given file."""
     import numpy as np
 
@@ -147,7 +147,7 @@ def _object_mesh(method: Method, step: int, scene: Scene, params: ExtractMeshPar
 
 
 def find_object_mesh(
-    method: Method, step: int, scene: Scene, params: ExtractMeshParams, panes: Sequence[np.ndarray] = ()
+    method: Model, step: int, scene: Scene, params: ExtractMeshParams, panes: Sequence[np.ndarray] = ()
 ) -> tuple[Choice, MeshResult | None]:
     """The mesh of the transparent object from the masks of the training views and the base set's depth after ``step``,
     and the fusion of depths if one was made. ``panes``: flat polygons (K, 3) that somebody drew, world frame.
@@ -217,12 +217,11 @@ def _against_truth(choice: Choice, scene: Scene) -> MeshTruth | None:
     )
 
 
-def _median_depths(method: Method, step: int, scene: Scene) -> list[Tensor]:
+def _median_depths(method: Model, step: int, scene: Scene) -> list[Tensor]:
     """(H, W) depth of the base set in every training view, the median where the method has one; 0 where nothing is."""
     import torch
 
-    from rtgs.methods import Mode, RenderOptions
-    from rtgs.methods.model import Model
+    from rtgs.methods import RenderOptions
     from rtgs.train.losses import surface_depth
 
     median = "median_depth" in method.maps
@@ -232,18 +231,14 @@ def _median_depths(method: Method, step: int, scene: Scene) -> list[Tensor]:
         if view.mask is None:
             depths.append(torch.zeros(view.camera.height, view.camera.width))
             continue
-        with torch.no_grad():
-            if isinstance(method, Model):
-                buffers = method.surface(view.camera, step, wanted)
-            else:
-                buffers = method.render(view.camera, step, Mode.EVALUATE, wanted).buffers
+        buffers = method.surface(view.camera, step, wanted)
         assert buffers.depth is not None
         depth = surface_depth(buffers.depth, buffers.alpha, buffers.median_depth, 1.0 if median else 0.0)
         depths.append(torch.where(torch.isfinite(depth) & (buffers.alpha >= 0.5), depth, 0.0).float())
     return depths
 
 
-def _depth_views(method: Method, step: int, scene: Scene, params: ExtractMeshParams) -> Iterator[DepthView]:
+def _depth_views(method: Model, step: int, scene: Scene, params: ExtractMeshParams) -> Iterator[DepthView]:
     """The depth of every training view, rendered when it is needed."""
     import torch
 

@@ -9,5 +9,5 @@ import time
 def work_time() -> float:
     """CPU seconds of this process, all threads, less what those of the native core (where it is loaded) spent waiting
     awake for work: that depends on what else the machine does."""
-    core = sys.modules.get("rtgs.native._core")
-    return time.process_time() - (core.seconds_awake() if core is not None else 0.0)
+    awake = getattr(sys.modules.get("rtgs.native._core"), "seconds_awake", None)
+    return time.process_time() - (awake() if awake is not None else 0.0)

@@ -20,7 +20,7 @@ from torch import Tensor
 from rtgs.mesh.guide import MeshGuide
 from rtgs.mesh.silhouettes import MaskView
 from rtgs.mesh.triangles import TriangleMesh
-from rtgs.native.threads import threads
+from rtgs.native.threads import serial_torch, threads
 
 HIDDEN = 1e9  # instead of a distance: the view says nothing about the point
 _CHUNK = 1 << 16  # points
@@ -156,7 +156,7 @@ class MaskField:
         return np.concatenate([self._outvoting(torch.from_numpy(chunk), counts) for chunk in chunks], axis=1)
 
     def _outvoting(self, points: Tensor, counts: Sequence[int]) -> np.ndarray:
-        with ThreadPoolExecutor(threads()) as workers:  # torch lets go of the interpreter while it computes
+        with serial_torch(), ThreadPoolExecutor(threads()) as workers:  # torch lets go of the interpreter
             values = torch.stack(list(workers.map(lambda outline: outline.distance(points), self.outlines)))
         smallest = values.topk(max(counts) + 1, dim=0, largest=False, sorted=True).values
         seen, heard = torch.isfinite(values).sum(0), (values < HIDDEN).sum(0)

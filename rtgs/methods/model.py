@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
+import torch
 from torch import Tensor
 
 from rtgs.core.cameras import Camera
@@ -169,8 +170,9 @@ class Model:
         """
         return self.seen(self._aimed(Frame(camera, step, mode, options, mask)))
 
+    @torch.no_grad()
     def surface(self, camera: Camera, step: int, options: RenderOptions = NO_OPTIONS) -> RasterBuffers:
-        """The maps of the base set in the view that :meth:`render` renders; nothing is shaded."""
+        """The buffers of :meth:`render`, without what it makes of them; no gradients."""
         return self.rasterize(self._aimed(Frame(camera, step, Mode.EVALUATE, options))).buffers
 
     def _aimed(self, frame: Frame) -> Frame:

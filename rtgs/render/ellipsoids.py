@@ -34,7 +34,7 @@ def rasterize_ellipsoids(
 ) -> EllipsoidBuffers:
     """Render N ellipsoids; :func:`rtgs.render.reference.ellipsoids.rasterize_ellipsoids` is its float64 twin.
 
-    Runs on :func:`~rtgs.native.threads.threads`; the result does not depend on their number, bit for bit. First
+    Runs on as many threads as :func:`rtgs.native.threads.threads` says; no bit of the result depends on it. First
     derivatives only: a second backward pass through the gradients raises.
 
     Parameters

@@ -22,7 +22,7 @@ class SurfelTree:
 
     ``build`` sorts the surfels anew; ``refit`` keeps the tree's shape and moves its boxes, which is many times faster
     but lets the tree age: ``surface_cost`` says how far. Results do not depend on which of the two was called, bit for
-    bit. Both run on :func:`~rtgs.native.threads.threads`.
+    bit. Both run on as many threads as :func:`rtgs.native.threads.threads` says.
     """
 
     def __init__(self) -> None:
@@ -141,7 +141,7 @@ def trace_surfels(
 ) -> TraceBuffers:
     """Trace R rays through N surfels; :func:`rtgs.render.reference.trace.trace_surfels` is its float64 twin.
 
-    Runs on :func:`~rtgs.native.threads.threads`; the result does not depend on their number, bit for bit. First
+    Runs on as many threads as :func:`rtgs.native.threads.threads` says; no bit of the result depends on it. First
     derivatives only: a second backward pass through the gradients raises.
 
     Parameters

@@ -270,6 +270,16 @@ def test_contents_are_the_same_traced_and_rasterised_but_none_is_missed(made: Gl
         assert float(traced.sum()) < 0.5 * float(rasterized.sum())
 
 
+def test_the_surface_is_that_of_what_is_rendered(made: GlassScene):
+    method, camera = begun(glass_recipe(), made), made.scene.test[0].camera
+    options = RenderOptions(depth=True, median_depth=True)
+    with torch.no_grad():
+        rendered = method.render(camera, 40, Mode.EVALUATE, options, made.scene.test[0].mask).buffers
+    surface = method.surface(camera, 40, options)
+    for name in ("features", "alpha", "depth", "median_depth"):
+        assert torch.equal(getattr(surface, name), getattr(rendered, name)), name
+
+
 def test_what_reads_single_rays_gets_them(made: GlassScene):
     clipped = begun(glass_recipe(contents="rasterized", first_bounce_end="clip"), made)
     assert [each.what for each in clipped.decisions if "contents" in each.what] == ["contents are traced"]

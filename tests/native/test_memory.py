@@ -35,7 +35,7 @@ def _rasterise() -> list[torch.Tensor]:
 
 
 def _trace() -> list[torch.Tensor]:
-    return everything(native_trace_scene(count=200, rays=300))
+    return everything(native_trace_scene(count=200, rays=1500))
 
 
 @pytest.mark.parametrize("threads", [1, 2])

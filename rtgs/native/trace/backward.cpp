@@ -275,25 +275,26 @@ void trace_backward(const TraceBackwardArgs& args) {
   const int threads = args.options.threads;
   const int64_t packets = packet_count(args.rays), groups = (packets + kGroup - 1) / kGroup;
   const int64_t surfels = args.surfels.arrays.count;
-  for (int part = 0; part < threads; ++part) workspace_of(args.workspaces, part).summed = 0;
-  in_turns(threads, groups, 1, [&](int part, Turns& turns) {
-    TraceWorkspace& work = workspace_of(args.workspaces, part);
-    const ColorMasks masks(args.surfels.feature_count());
-    for (int64_t group, after; turns.next(group, after);) {
-      GroupRows rows(work, surfels, args.row_stride);
-      const int64_t end = after * kGroup < packets ? after * kGroup : packets;
-      for (int64_t packet = group * kGroup; packet < end; ++packet)
-        PacketBackward(args, work, rows, masks, packet).run();
-      args.groups[group] = rows.done(part);
-      if (threads > 1) continue;
-      add_group(args, args.groups[group], 0, surfels);
-      work.summed = 0;
-    }
-  });
-  if (threads == 1) return;
-  in_shares(threads, surfels, [&](int64_t begin, int64_t end) {
-    for (int64_t group = 0; group < groups; ++group) add_group(args, args.groups[group], begin, end);
-  });
+  // In waves, for the rows of all that wait are in memory. What a wave holds decides no order of additions.
+  const int64_t wave = threads == 1 ? 1 : int64_t(threads) * kGroupsInWave;
+  const ColorMasks masks(args.surfels.feature_count());
+  for (int64_t first = 0; first < groups; first += wave) {
+    const int64_t count = groups - first < wave ? groups - first : wave;
+    for (int part = 0; part < threads; ++part) workspace_of(args.workspaces, part).summed = 0;
+    in_turns(threads, count, 1, [&](int part, Turns& turns) {
+      TraceWorkspace& work = workspace_of(args.workspaces, part);
+      for (int64_t group, after; turns.next(group, after);) {
+        GroupRows rows(work, args.surfel_gradients ? surfels : 0, args.row_stride);
+        const int64_t begin = (first + group) * kGroup, end = begin + kGroup < packets ? begin + kGroup : packets;
+        for (int64_t packet = begin; packet < end; ++packet) PacketBackward(args, work, rows, masks, packet).run();
+        args.groups[group] = rows.done(part);
+      }
+    });
+    if (!args.surfel_gradients) continue;
+    in_shares(threads, surfels, [&](int64_t begin, int64_t end) {
+      for (int64_t group = 0; group < count; ++group) add_group(args, args.groups[group], begin, end);
+    });
+  }
 }
 
 }  // namespace rtgs::RTGS_ISA

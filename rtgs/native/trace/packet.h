@@ -119,7 +119,7 @@ struct TraceWorkspace {
   Growing<uint64_t> long_keys, spare_keys;
   // Of the backward pass.
   Growing<uint64_t> clamped;    // by surfel met: colours at zero, a bit per ray, 16 bits apart per channel
-  Growing<float> summed_rows;     // of the groups of packets, one after the other (rows.h)
+  Growing<float> summed_rows;   // of the groups of packets, one after the other (rows.h)
   Growing<int32_t> summed_slots, places;  // of each row its surfel; of each surfel its last row
   int64_t summed;
 

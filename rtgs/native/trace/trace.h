@@ -113,9 +113,8 @@ struct TraceBackwardArgs {
   bool surfel_gradients, ray_gradients;  // what is wanted: rows; out_origins and out_directions
   float *out_origins, *out_directions;
   int* poisoned;          // set to 1 when an upstream gradient is NaN or infinite
-  // Packets come in groups, whose sums are added in their order: so no bit depends on the number of threads. One thread
-  // adds those of each group at once, several when all groups are done.
-  TraceGroup* groups;     // (packets) at most
+  // Packets come in groups, whose sums are added in their order: so no bit depends on the number of threads.
+  TraceGroup* groups;     // those that are summed and not yet added; no more than there are packets
 };
 
 struct TraceGradients {  // null: not wanted

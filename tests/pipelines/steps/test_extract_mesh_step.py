@@ -39,14 +39,17 @@ class SphereMethod:
 
     maps = ("depth", "median_depth")
 
-    def render(self, camera: Camera, step: int, mode: Mode, options: RenderOptions) -> RenderedView:
+    def surface(self, camera: Camera, step: int, options: RenderOptions) -> RasterBuffers:
         assert options.depth
         near, _ = sphere_depths(camera, 1.0)
         alpha = torch.isfinite(near).float() * 0.8
         depth = torch.where(alpha > 0, near, 0.0).float() * alpha
         image = torch.full((3, camera.height, camera.width), 0.4)
-        buffers = RasterBuffers(image, alpha, depth=depth, median_depth=torch.where(alpha > 0, near, 0.0).float())
-        return RenderedView(camera, image, buffers)
+        return RasterBuffers(image, alpha, depth=depth, median_depth=torch.where(alpha > 0, near, 0.0).float())
+
+    def render(self, camera: Camera, step: int, mode: Mode, options: RenderOptions) -> RenderedView:
+        buffers = self.surface(camera, step, options)
+        return RenderedView(camera, buffers.features, buffers)
 
 
 def sphere_scene(masked: bool) -> Scene:
