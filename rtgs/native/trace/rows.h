@@ -18,7 +18,7 @@ struct RowLayout {
 
 // ---- groups ------------------------------------------------------------------------------------------------------
 constexpr int64_t kGroup = 32;  // packets; where rays are coherent they meet the same surfels: few rows, in the cache
-constexpr int64_t kGroupsInWave = 64;  // for each thread
+constexpr int64_t kGroupsInWave = 16;  // for each thread
 
 // The rows of one group of packets, at the end of those of its thread.
 class GroupRows {
