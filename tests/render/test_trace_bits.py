@@ -24,6 +24,13 @@ def test_bits_do_not_depend_on_the_number_of_threads(isa: str, size: float):
         assert_same_bits(expected, everything(scene))
 
 
+def test_more_groups_of_packets_than_threads_take_at_once_give_the_same_bits(isa: str):
+    scene = native_trace_scene(60, 40_000, 3, size=0.1)  # of 16 rays and 32 packets: 79 groups, 32 at once
+    expected = everything(scene)
+    torch.set_num_threads(2)
+    assert_same_bits(expected, everything(scene))
+
+
 def test_refit_and_rebuild_give_the_same_bits(isa: str):
     scene = native_trace_scene(1000, 600)
     tree = SurfelTree().build(*scene.all()[:GEOMETRY])
