@@ -74,9 +74,10 @@ class Tracing {
     sorted_ = order_ != "given" && sort_rays(args.rays, args.tree);
     args.rays.order = sorted_ ? m.order.get() : nullptr;
     float* records = m.records.reserve(kTraceFields * (count + 1));
+    SlotBoxes* boxes = m.boxes.reserve(count / kSlotsPerBlock + 1);
     RTGS_CALL(isa_, trace_records, surfels_.arrays, args.tree, options_.alpha_cutoff, records,
-              m.slots.reserve(count + 1), options_.threads);
-    args.records = records;
+              boxes, m.slots.reserve(count + 1), options_.threads);
+    args.records = records, args.boxes = boxes;
     packets_ = (args.rays.count + RTGS_CALL(isa_, packet_lanes) - 1) / RTGS_CALL(isa_, packet_lanes);
     if (keep || out_weight_sum) args.tapes = m.tapes.reserve(packets_ + 1);
     std::vector<TapeArena> arenas = fresh_arenas(m.tape_blocks);

@@ -207,9 +207,9 @@ static inline vmask lanes_from_bits(uint32_t bits) {
 #if defined(__AVX512F__)
   return vmask(bits);
 #else
-  vint m;
-  for (int lane = 0; lane < kLanes; ++lane) m[lane] = bits >> lane & 1 ? -1 : 0;
-  return m;
+  vint bit;  // of each lane: a constant
+  for (int lane = 0; lane < kLanes; ++lane) bit[lane] = 1 << lane;
+  return (broadcast_int(int32_t(bits)) & bit) == bit;
 #endif
 }
 

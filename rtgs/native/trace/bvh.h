@@ -1,4 +1,4 @@
-// The bounding volume hierarchy over surfels (docs/tracer.md): 8 children a node, leaves of up to 12 surfels.
+// The bounding volume hierarchy over surfels (docs/tracer.md): 8 children a node, leaves of up to 48 surfels.
 #pragma once
 #include <cstdint>
 
@@ -7,20 +7,26 @@
 namespace rtgs {
 
 constexpr int kNodeChildren = 8;
-constexpr int kMostPerLeaf = 12;
+constexpr int kMostPerLeaf = 48;
+constexpr int kSlotsPerBlock = 8;  // whose boxes are tested at once
+static_assert(kMostPerLeaf + kSlotsPerBlock - 1 <= 64, "a bit for each surfel of a leaf and of the blocks it lies in");
 constexpr int32_t kNoChild = INT32_MIN;
 
 struct alignas(64) TreeNode {
   float low[3][kNodeChildren], high[3][kNodeChildren];  // low > high: nothing in it that a ray can hit
-  int32_t child[kNodeChildren];                         // >= 0: node; kNoChild; else ~(16 * first slot + count)
+  int32_t child[kNodeChildren];                         // >= 0: node; kNoChild; else ~(64 * first slot + count)
 };
-static inline int32_t leaf_of(int32_t first, int32_t count) { return ~(16 * first + count); }
-static inline int32_t leaf_first(int32_t child) { return ~child >> 4; }
-static inline int32_t leaf_count(int32_t child) { return ~child & 15; }
+static inline int32_t leaf_of(int32_t first, int32_t count) { return ~(64 * first + count); }
+static inline int32_t leaf_first(int32_t child) { return ~child >> 6; }
+static inline int32_t leaf_count(int32_t child) { return ~child & 63; }
 
 struct SurfelBox {  // components 0..2 count
   alignas(16) float low[4];
   alignas(16) float high[4];
+};
+
+struct alignas(64) SlotBoxes {  // of a block of slots; those of the surfels that are never hit hold nothing
+  float low[3][kSlotsPerBlock], high[3][kSlotsPerBlock];
 };
 
 struct TreeView {  // what the kernels see; surfels in the order of the leaves are called slots

@@ -179,8 +179,8 @@ int32_t SurfelTree::build_node(const Range& range) {
 }
 
 void SurfelTree::build(const SurfelArrays& surfels, float alpha_cutoff, int threads) {
-  if (surfels.count >= int64_t(1) << 27)
-    throw std::invalid_argument("SurfelTree.build: " + std::to_string(surfels.count) + " surfels, at most 2^27 - 1");
+  if (surfels.count >= int64_t(1) << 25)
+    throw std::invalid_argument("SurfelTree.build: " + std::to_string(surfels.count) + " surfels, at most 2^25 - 1");
   try {
     measure_boxes(surfels, alpha_cutoff, threads);
     ids_.resize(surfels.count);

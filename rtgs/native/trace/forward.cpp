@@ -25,6 +25,7 @@ class PacketTracer {
  private:
   void visit_node(int32_t index);
   void visit_leaf(int32_t child);
+  uint64_t near_surfels(int32_t first, int32_t count) const;
   void wait(PendingChild entry);
   // Composites the waiting hits with t < before, lane by lane in their order.
   void settle(float before);
@@ -42,6 +43,11 @@ class PacketTracer {
   void write_normal();
   void write_tape(PacketTape& tape, TapeArena& arena);
 
+  void prefetch_leaf(int32_t first) const {
+    const SlotBoxes& boxes = args_.boxes[first / kSlotsPerBlock];
+    for (int line = 0; line < 3; ++line) __builtin_prefetch(reinterpret_cast<const char*>(&boxes) + 64 * line);
+    __builtin_prefetch(record(first));
+  }
   const float* record(int32_t slot) const { return args_.records + int64_t(kTraceFields) * slot; }
 
   const TraceForwardArgs& args_;
@@ -74,9 +80,21 @@ inline void PacketTracer::visit_node(int32_t index) {
     if (!any(met)) continue;
     const int32_t child = node.child[k];
     if (child >= 0) __builtin_prefetch(&args_.tree.nodes[child]);
-    else __builtin_prefetch(record(leaf_first(child)));
+    else prefetch_leaf(leaf_first(child));
     wait({smallest(select(met, nearest, broadcast(kFarAway))), child, mask_bits(met)});
   }
+}
+
+// Of the slots from `first` on, those, as bits, whose surfels the box of all the rays may meet.
+inline uint64_t PacketTracer::near_surfels(int32_t first, int32_t count) const {
+  const int32_t skipped = first % kSlotsPerBlock;
+  const SlotBoxes* boxes = args_.boxes + first / kSlotsPerBlock;
+  uint64_t near = slabs_.may_meet(boxes->low, boxes->high);
+  for (int32_t k = kSlotsPerBlock; k < skipped + count; k += kSlotsPerBlock) {
+    ++boxes;
+    near |= uint64_t(slabs_.may_meet(boxes->low, boxes->high)) << k;
+  }
+  return near >> skipped & ((uint64_t(1) << count) - 1);
 }
 
 inline void PacketTracer::visit_leaf(int32_t child) {
@@ -90,11 +108,12 @@ inline void PacketTracer::visit_leaf(int32_t child) {
   // Locals: a store through a vector may alias any member.
   float *t = work_.t.data, *exponents = work_.exponents.data, *weights = work_.weights.data;
   int32_t *slots = work_.slots.data, *columns = work_.columns.data;
-  const float* s = record(first);
   const vfloat t_max = t_max_;
   uint32_t lanes[kMostPerLeaf];
   int found = 0;  // without a branch: a wrong guess costs as much as several tests
-  for (int32_t slot = first; slot < first + count; ++slot, s += kTraceFields) {
+  for (uint64_t near = near_surfels(first, count); near; near &= near - 1) {
+    const int32_t slot = first + __builtin_ctzll(near);
+    const float* s = record(slot);
     const PlaneHit hit = plane_hit(s, rays_);
     const vmask counts = le(hit.rho, broadcast(s[kTraceReach])) & gt(hit.t, rays_.t_min) & lt(hit.t, t_max) &
                          ge(abs(hit.cosine), rays_.least_cosine);

@@ -26,6 +26,7 @@ class ArenaBlocks {
 
 struct TraceMemory {
   Buffer<float> records;
+  Buffer<SlotBoxes> boxes;
   Buffer<float> rows;  // one gradient row per slot
   Buffer<uint8_t> touched;
   Buffer<int32_t> slots, order;

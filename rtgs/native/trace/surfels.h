@@ -34,6 +34,25 @@ struct SurfelLanes {
     const vfloat over_cut = select(hittable, opacity, broadcast(alpha_cutoff)) / alpha_cutoff;
     reach = select(hittable, max(log2(over_cut), broadcast(0.f)) * (1.f / kHalfLog2E), broadcast(-1.f));
   }
+
+  // Box of the part where alpha reaches the cut, empty for what is never hit. Padded so that a hit which the tracer
+  // accepts lies inside in spite of rounding: in the plane of the surfel by a part of its extent, off the plane by a
+  // part of its distance from the world's origin (the tracer pads by the ray's own).
+  void bound(vfloat* low, vfloat* high) const {
+    const vfloat radius = sqrt(max(reach, broadcast(0.f)));
+    const vfloat m[] = {mean.x, mean.y, mean.z};
+    const vfloat u[] = {tangent_u.x, tangent_u.y, tangent_u.z}, v[] = {tangent_v.x, tangent_v.y, tangent_v.z};
+    const vfloat magnitude = max(max(abs(m[0]), abs(m[1])), abs(m[2]));
+    for (int k = 0; k < 3; ++k) {
+      // hypot, without overflow of the squares
+      const vfloat a = abs(u[k] * scale_u), b = abs(v[k] * scale_v), larger = max(a, b);
+      const vfloat ratio = min(a, b) / max(larger, broadcast(1e-37f));
+      const vfloat half = radius * larger * sqrt(1.f + ratio * ratio);
+      const vfloat padded = half * 1.00002f + (magnitude + half) * kBoxPadding;
+      low[k] = select(hittable, m[k] - padded, broadcast(3.4e38f));
+      high[k] = select(hittable, m[k] + padded, broadcast(-3.4e38f));
+    }
+  }
 };
 
 }  // namespace rtgs::RTGS_ISA

@@ -84,6 +84,7 @@ struct TraceForwardArgs {
   TraceOptionsNative options;
   TreeView tree;
   const float* records;   // (N, kTraceFields)
+  const SlotBoxes* boxes;  // (N / 8 + 1)
   PacketTape* tapes;      // (packets), or null where neither a backward pass nor the weights are wanted
   TapeArena* arenas;      // (threads)
   void** workspaces;      // (threads) made on first use, see free_trace_workspace
@@ -129,8 +130,8 @@ struct TraceGradients {  // null: not wanted
   int packet_lanes();                                                                                                 \
   int trace_row_stride(const TraceSurfels&);                                                                          \
   int first_coefficient(const TraceSurfels&);                                                                         \
-  void trace_records(const SurfelArrays&, const TreeView&, float alpha_cutoff, float* records, int32_t* slots,        \
-                     int threads);                                                                                    \
+  void trace_records(const SurfelArrays&, const TreeView&, float alpha_cutoff, float* records, SlotBoxes* boxes,      \
+                     int32_t* slots, int threads);                                                                    \
   bool order_rays(const RayOrderArgs&);                                                                               \
   int64_t order_scratch();                                                                                            \
   void trace_forward(TraceForwardArgs&);                                                                              \

@@ -41,18 +41,20 @@ class PacketSlabs {
 
   // Children, as bits, that the box of all the rays may meet: no child is missed.
   uint32_t may_meet(const TreeNode& node) const {
+    return may_meet(node.low, node.high) & bits8(load8(node.low[0]), load8(node.high[0]));
+  }
+  // The same of any 8 boxes; one that holds nothing may be among them.
+  uint32_t may_meet(const float (&low)[3][8], const float (&high)[3][8]) const {
     Float8 nearest = Float8{} + nearest_, farthest = Float8{} + kFarAway;
     for (int k = 0; k < 3; ++k) {
       const Axis& axis = axes_[k];
       if (!axis.sign) continue;
-      const float* entry = axis.sign > 0 ? node.low[k] : node.high[k];
-      const float* exit = axis.sign > 0 ? node.high[k] : node.low[k];
-      const Float8 a = load8(entry) * float(axis.sign) - axis.last_origin;
-      const Float8 b = load8(exit) * float(axis.sign) - axis.first_origin;
+      const Float8 a = load8(axis.sign > 0 ? low[k] : high[k]) - axis.last_origin;
+      const Float8 b = load8(axis.sign > 0 ? high[k] : low[k]) - axis.first_origin;
       nearest = max8(nearest, min8(a * axis.slowest, a * axis.fastest));
       farthest = min8(farthest, max8(b * axis.slowest, b * axis.fastest));
     }
-    return bits8(nearest, farthest) & bits8(load8(node.low[0]), load8(node.high[0]));
+    return bits8(nearest, farthest);
   }
 
   // Rays that meet the child's box before t_max, and where.
@@ -71,14 +73,15 @@ class PacketSlabs {
  private:
   struct Axis {
     int sign;  // of all directions; 0: they differ
-    float first_origin, last_origin, slowest, fastest;  // along that sign; |1/d| bounds
+    float first_origin, last_origin, slowest, fastest;  // along that sign; bounds of 1/d
   };
   static void bound_axis(Axis& axis, vfloat origin, vfloat scale, vfloat padding) {
     const vfloat speed = abs(scale);
-    axis.slowest = smallest(speed), axis.fastest = largest(speed);
     axis.sign = smallest(scale) > 0.f ? 1 : largest(scale) < 0.f ? -1 : 0;
-    const vfloat along = origin * float(axis.sign);
-    axis.first_origin = smallest(along - padding), axis.last_origin = largest(along + padding);
+    const float sign = float(axis.sign);
+    axis.slowest = sign * smallest(speed), axis.fastest = sign * largest(speed);
+    const vfloat along = origin * sign;
+    axis.first_origin = sign * smallest(along - padding), axis.last_origin = sign * largest(along + padding);
   }
 
   vfloat scale_[3], low_shift_[3], high_shift_[3], t_min_;
