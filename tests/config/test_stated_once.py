@@ -48,8 +48,9 @@ def idle(own: Mapping[str, object], below: list[Mapping[str, object]]) -> list[s
 def presets() -> Iterator[tuple[str, list[str]]]:
     """Each file of presets with those below it, farthest first."""
     yield "short_presets", []
-    yield "preset/quick", ["short_presets"]
-    yield "preset/smoke", ["short_presets", "preset/quick"]
+    yield "quick_recipe", ["short_presets"]
+    yield "preset/quick", ["short_presets", "quick_recipe"]
+    yield "preset/smoke", ["short_presets", "quick_recipe", "preset/quick"]
     yield "preset/standard", ["short_presets"]
 
 
@@ -78,7 +79,8 @@ def test_the_presets_below_a_preset_are_those_it_lists():
     for name, below in presets():
         content = yaml.safe_load((conf_dir() / f"{name}.yaml").read_text())
         listed = [f"preset/{file}".replace("preset//", "") for file in content.get("defaults", ["_self_"])[:-1]]
-        assert listed == below[-1:], name
+        assert ("/" in name) == bool(listed), name
+        assert below[len(below) - len(listed) :] == listed, name
     published = {"paper", "paper_synthetic"}
     assert {name.split("/")[1] for name, _ in presets() if "/" in name} == set(choices_of("preset")) - published
 
@@ -86,7 +88,7 @@ def test_the_presets_below_a_preset_are_those_it_lists():
 @pytest.mark.parametrize("ablation", [name for name in choices_of("ablation") if name != "none"])
 def test_no_ablation_restates_what_its_methods_have(ablation):
     own = {key: value for key, value in stated(f"ablation/{ablation}").items() if not key.startswith("ablation.")}
-    stacks = [[], *([*below, name] for name, below in presets() if name != "short_presets")]
+    stacks = [[], *([*below, name] for name, below in presets() if "/" in name)]
     below = [layers(method, files) for method in TRAINED if ablation in fitting(method) for files in stacks]
     assert below
     assert idle(own, below) == []
