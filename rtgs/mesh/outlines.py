@@ -10,7 +10,7 @@ contents of a cup) says nothing at all: the cup counts as closed, for its wall i
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -153,11 +153,12 @@ class MaskField:
         too few have in the picture is outside.
         """
         chunks = np.array_split(points, max(1, -(-len(points) // _CHUNK)))
-        return np.concatenate([self._outvoting(torch.from_numpy(chunk), counts) for chunk in chunks], axis=1)
-
-    def _outvoting(self, points: Tensor, counts: Sequence[int]) -> np.ndarray:
         with serial_torch(), ThreadPoolExecutor(threads()) as workers:  # torch lets go of the interpreter
-            values = torch.stack(list(workers.map(lambda outline: outline.distance(points), self.outlines)))
+            found = [self._outvoting(torch.from_numpy(chunk), counts, workers) for chunk in chunks]
+        return np.concatenate(found, axis=1)
+
+    def _outvoting(self, points: Tensor, counts: Sequence[int], workers: Executor) -> np.ndarray:
+        values = torch.stack(list(workers.map(lambda outline: outline.distance(points), self.outlines)))
         smallest = values.topk(max(counts) + 1, dim=0, largest=False, sorted=True).values
         seen, heard = torch.isfinite(values).sum(0), (values < HIDDEN).sum(0)
         ranks = [(k * heard) // len(values) for k in counts]
