@@ -153,12 +153,13 @@ class MaskField:
         too few have in the picture is outside.
         """
         chunks = np.array_split(points, max(1, -(-len(points) // _CHUNK)))
-        with serial_torch(), ThreadPoolExecutor(threads()) as workers:  # torch lets go of the interpreter
+        with ThreadPoolExecutor(threads()) as workers:
             found = [self._outvoting(torch.from_numpy(chunk), counts, workers) for chunk in chunks]
         return np.concatenate(found, axis=1)
 
     def _outvoting(self, points: Tensor, counts: Sequence[int], workers: Executor) -> np.ndarray:
-        values = torch.stack(list(workers.map(lambda outline: outline.distance(points), self.outlines)))
+        with serial_torch():  # which lets go of the interpreter: views in threads
+            values = torch.stack(list(workers.map(lambda outline: outline.distance(points), self.outlines)))
         smallest = values.topk(max(counts) + 1, dim=0, largest=False, sorted=True).values
         seen, heard = torch.isfinite(values).sum(0), (values < HIDDEN).sum(0)
         ranks = [(k * heard) // len(values) for k in counts]

@@ -85,6 +85,11 @@ def test_the_presets_below_a_preset_are_those_it_lists():
     assert {name.split("/")[1] for name, _ in presets() if "/" in name} == set(choices_of("preset")) - published
 
 
+def test_standard_of_rtgs_restates_nothing_of_what_it_takes():
+    below = layers("rtgs", ["short_presets", "preset/standard", "quick_recipe"])
+    assert idle(stated("method_in_preset/standard_rtgs"), [below]) == []
+
+
 @pytest.mark.parametrize("ablation", [name for name in choices_of("ablation") if name != "none"])
 def test_no_ablation_restates_what_its_methods_have(ablation):
     own = {key: value for key, value in stated(f"ablation/{ablation}").items() if not key.startswith("ablation.")}

@@ -134,6 +134,43 @@ def test_a_surfel_that_is_not_finite_changes_nothing(isa: str, bad: float, name:
         assert torch.equal(a, b), label
 
 
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("name", ["origins", "directions"])
+def test_a_ray_that_is_not_finite_changes_no_other(isa: str, bad: float, name: str):
+    """Wherever it is in its packet, and whichever of its components it is."""
+    scene = native_trace_scene(200, 96)
+    tensor = dict(scene.items())[name].clone()
+    rows = torch.tensor([3, 15, 31, 36, 95])
+    tensor[rows, torch.tensor([0, 2, 1, 2, 2])] = bad
+    found, expected = everything(replace(scene, **{name: tensor})), everything(scene)
+    others = torch.ones(96, dtype=torch.bool).index_fill(0, rows, False)
+    for label, a, b in zip(OUTPUTS, found, expected, strict=False):
+        assert torch.equal(a[others], b[others]), label
+        assert not a[rows].any(), label
+
+
+@pytest.mark.parametrize("length", [2.0**-100, 2.0**-66, 2.0**-33, 2.0**33, 2.0**66])
+def test_directions_of_any_length_meet_the_same(isa: str, length: float):
+    """Rays along the axes to small surfels: what their components of zero count as grows with the others."""
+    scene = native_trace_scene(300, 300, size=0.002)
+    axis = torch.arange(300) % 3
+    along = torch.nn.functional.one_hot(axis, 3).float()
+    scene = replace(scene, origins=scene.means - 4 * along, directions=along)
+    unit, scaled = everything(scene), everything(replace(scene, directions=length * along))
+    for label, a, b in zip(OUTPUTS, unit, scaled, strict=False):
+        b = b * length if label == "depth" else b
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5, msg=label)
+    assert (unit[OUTPUTS.index("alpha")] > 0).float().mean() > 0.9
+
+
+def test_boxes_whose_area_overflows_make_a_tree(isa: str):
+    """Flat ones: infinity times zero."""
+    u = torch.tensor([[0.8, 0.6, 0.0]]).expand(60, 3)
+    v = torch.tensor([[0.6, -0.8, 0.0]]).expand(60, 3)
+    tree = SurfelTree().build(torch.zeros(60, 3), u, v, torch.full((60, 2), 2e38), torch.full((60,), 0.9))
+    assert tree.surfels == 60
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_any_finite_input_gives_finite_results(isa: str, seed: int):
     """A share of all values, those of the rays included, becomes +-1e-30 to 1e30."""

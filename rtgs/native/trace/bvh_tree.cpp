@@ -160,9 +160,9 @@ int32_t SurfelTree::build_node(const Range& range) {
   int count = 1;
   while (count < kNodeChildren) {  // splits the largest part that is too many for a leaf
     int largest = -1;
-    float area = -1.f;
+    float area = 0.f;
     for (int k = 0; k < count; ++k)
-      if (parts[k].count() > kMostPerLeaf && parts[k].bounds.half_area() > area)
+      if (parts[k].count() > kMostPerLeaf && (largest < 0 || parts[k].bounds.half_area() > area))  // may be NaN
         largest = k, area = parts[k].bounds.half_area();
     if (largest < 0) break;
     const Range whole = parts[largest];

@@ -40,26 +40,28 @@ struct Growing {
 struct PacketRays {
   vfloat ox, oy, oz, dx, dy, dz, length, least_cosine, t_min, t_max;
   vint ray;
-  vmask exists, usable;  // usable: exists, and is finite
+  vmask exists, usable;  // usable: exists, and is finite; of others origin and direction are 0
   int count;
 
   PacketRays(const TraceRays& rays, int64_t packet) {
     const int64_t first = packet * kLanes;
     count = int(rays.count - first < kLanes ? rays.count - first : kLanes);
     exists = first_lanes(count);
-    // Lanes past the last ray repeat it, and have stopped.
+    // Lanes past the last ray repeat its bounds, and have stopped.
     ray = min_int(truncate(lane_numbers()), broadcast_int(count - 1)) + int32_t(first);
     if (rays.order) ray = gather_int(rays.order, ray);
     const vint row = ray * 3;
     ox = gather(rays.origins, row), oy = gather(rays.origins + 1, row), oz = gather(rays.origins + 2, row);
     dx = gather(rays.directions, row), dy = gather(rays.directions + 1, row), dz = gather(rays.directions + 2, row);
+    usable = exists & finite(ox) & finite(oy) & finite(oz) & finite(dx) & finite(dy) & finite(dz);
+    ox = where(usable, ox), oy = where(usable, oy), oz = where(usable, oz);
+    dx = where(usable, dx), dy = where(usable, dy), dz = where(usable, dz);
     const vfloat longest = max(max(max(abs(dx), abs(dy)), abs(dz)), broadcast(1e-37f));  // no square overflows
     const vfloat x = dx / longest, y = dy / longest, z = dz / longest;
     length = longest * sqrt(x * x + y * y + z * z);
     least_cosine = kGrazing * length;
     t_min = rays.t_min_each ? gather(rays.t_min_each, ray) : broadcast(rays.t_min);
     t_max = rays.t_max_each ? gather(rays.t_max_each, ray) : broadcast(rays.t_max);
-    usable = exists & finite(ox) & finite(oy) & finite(oz) & finite(dx) & finite(dy) & finite(dz);
     t_max = select(usable, min(t_max, broadcast(kFarAway)), broadcast(-kFarAway));
   }
   // Where colours are looked up: at the unit direction, or at the direction as it is given.

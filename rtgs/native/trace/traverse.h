@@ -25,7 +25,8 @@ static inline uint32_t bits8(Float8 low, Float8 high) {  // low <= high
 class PacketSlabs {
  public:
   explicit PacketSlabs(const PacketRays& r) {
-    const vfloat tiny = broadcast(1e-12f);
+    // A smaller component counts as this one: what that moves a hit aside is less than half a padding.
+    const vfloat tiny = max(r.length, broadcast(1e-29f)) * 1e-8f;
     const vfloat d[3] = {r.dx, r.dy, r.dz}, o[3] = {r.ox, r.oy, r.oz};
     const vfloat padding = kBoxPadding * max(max(abs(o[0]), abs(o[1])), abs(o[2]));
     for (int k = 0; k < 3; ++k) {
@@ -33,10 +34,10 @@ class PacketSlabs {
       const vfloat shift = -o[k] * scale_[k], pad = padding * scale_[k];
       low_shift_[k] = shift - pad;
       high_shift_[k] = shift + pad;
-      bound_axis(axes_[k], o[k], scale_[k], padding);
+      bound_axis(axes_[k], o[k], scale_[k], padding, r.usable);
     }
     t_min_ = r.t_min;
-    nearest_ = smallest(r.t_min);
+    nearest_ = smallest_of(r.usable, r.t_min);
   }
 
   // Children, as bits, that the box of all the rays may meet: no child is missed.
@@ -75,13 +76,16 @@ class PacketSlabs {
     int sign;  // of all directions; 0: they differ
     float first_origin, last_origin, slowest, fastest;  // along that sign; bounds of 1/d
   };
-  static void bound_axis(Axis& axis, vfloat origin, vfloat scale, vfloat padding) {
+  static float smallest_of(vmask rays, vfloat v) { return smallest(select(rays, v, broadcast(kFarAway))); }
+  static float largest_of(vmask rays, vfloat v) { return -smallest_of(rays, -v); }
+  static void bound_axis(Axis& axis, vfloat origin, vfloat scale, vfloat padding, vmask rays) {
     const vfloat speed = abs(scale);
-    axis.sign = smallest(scale) > 0.f ? 1 : largest(scale) < 0.f ? -1 : 0;
+    axis.sign = smallest_of(rays, scale) > 0.f ? 1 : largest_of(rays, scale) < 0.f ? -1 : 0;
     const float sign = float(axis.sign);
-    axis.slowest = sign * smallest(speed), axis.fastest = sign * largest(speed);
+    axis.slowest = sign * smallest_of(rays, speed), axis.fastest = sign * largest_of(rays, speed);
     const vfloat along = origin * sign;
-    axis.first_origin = sign * smallest(along - padding), axis.last_origin = sign * largest(along + padding);
+    axis.first_origin = sign * smallest_of(rays, along - padding);
+    axis.last_origin = sign * largest_of(rays, along + padding);
   }
 
   vfloat scale_[3], low_shift_[3], high_shift_[3], t_min_;
