@@ -163,10 +163,14 @@ def stage_shares(
     method: Model, scene: Scene, seed: int, now: Callable[[], float], stage: Stage, preset_steps: int
 ) -> StageShares:
     """Train one stage of the method under the clocks; ``preset_steps``: in the schedule as it is."""
+    from rtgs.methods.plans import views_schedule
     from rtgs.train.trainer import Trainer
 
     clock = PartClock(now)
-    trainer = Trainer(method, scene, seed=seed, stage=stage)
+    views = None  # as in :func:`pipelines.steps.training.train_stage`
+    if stage.name == "transmittance":
+        views = views_schedule(method.settings.transmittance, method.schedule, stage.from_step)
+    trainer = Trainer(method, scene, seed=seed, stage=stage, views=views)
     began = work_time()
     with clocks(clock), clock.part("shading"):
         trainer.run()

@@ -222,6 +222,8 @@ class TransmittanceSettings:
 
     enabled: bool = True  # False: the run ends after the second stage
     start: float = 1 / 3  # share of the run: 20,000 of 60,000
+    # Until this share of the run the stage sees views of half the size (docs/lab/glass_light.md); 0: none.
+    half_size_until: float = field(default=0.0, metadata=UNLESS_DEFAULT)
     # Decision 26: what it meets; "base": the base set inside; "none": nothing.
     first_bounce: Literal["transmittance", "base", "none"] = "transmittance"
     # Decision 17: the paper relies on L_d; "clip": no hit counts behind the back surface.
@@ -237,15 +239,13 @@ class TransmittanceSettings:
     normal: Literal["base", "mesh"] = "base"
     # S_max in the object's pixels, whose f0 stays low; None: optics.max_gain. w_r is bounded by max_weight.
     max_gain: float | None = 16.0
-    # Both of the interface, without one (interface.count 0, the paper) neither acts: the largest w_r in the object's
-    # pixels, for an S_max of 16 alone lets its rim glow and darkens the set (0: none), and how many pixels around them
-    # get straight rays too, for interface surfels reach over the outline.
+    # Both of the interface, without one (interface.count 0) neither acts: the largest w_r in the object's pixels, whose
+    # rim else glows (0: none), and how many pixels around get straight rays too: surfels reach over the outline.
     max_weight: float = 1.0
     # "clamp": w_r above max_weight teaches roughness and f0 nothing; "smooth": it nears max_weight and always does.
     weight_bound: Literal["clamp", "smooth"] = field(default="smooth", metadata={"recipe": UNLESS, "value": "clamp"})
     rim: int = 2
-    # Samples of each pixel at the object's outline, 4, 9, 16, ...: which share of it shows the object, and how much the
-    # wall reflects there, with wall.light=fresnel (docs/glass_walls.md). 0: the pixel's centre speaks for all of it.
+    # With wall.light=fresnel: samples of each pixel at the object's outline, 4, 9, ... (docs/glass_walls.md); 0: none.
     rim_samples: int = field(default=0, metadata=UNLESS_DEFAULT)
     # Share of the masked pixels whose base depth is the object's first surface; with more the object is opaque and the
     # stage left out (docs/lab/transmittance.md: thin glass 0.27 to 0.73). 1: never.
@@ -265,8 +265,7 @@ class TransmittanceSettings:
     per_cell: int = 5
     most_hits: float = 80.0  # of a ray through the random set: its surfels are shrunk until no more are expected
     freeze_base: bool = True  # decision 18: density control and resets of the base set end here; False: EnvGS's windows
-    # Decision 21: of the mesh, needs no mask at test views; "given": the scene's
-    # where the mesh is met too; "as_trained": the scene's as they are, as in training.
+    # Decision 21: of the mesh; "given": the scene's where the mesh is met too; "as_trained": the scene's as they are.
     test_masks: Literal["silhouette", "given", "as_trained"] = "silhouette"
     offset: float = 1e-4  # of the first bounce's start, times the extent
     opaque: float = 1 / 255  # no second bounce where the first leaves less light than this
@@ -303,7 +302,7 @@ class TransmittanceSettings:
         refuse_outside(self, "method.transmittance", 0, 1, "opaque_share", "opaque", "alpha_cutoff")
         key = "method.transmittance.start_opacity"
         refuse_unless(0 < self.start_opacity <= 1, key, self.start_opacity, "above 0 and at most 1")
-        for name in ("start", "densify_until"):
+        for name in ("start", "half_size_until", "densify_until"):
             value = getattr(self, name)
             refuse_unless(0 <= value <= 1, f"method.transmittance.{name}", value, "between 0 and 1")
         for name in ("densify_every", "sh_every", "cells", "per_cell", "rebuild_every", "most_hits"):

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from rtgs.scenes.scene import View
 
 LEAST_SIDE = 32  # pixels of the short side of a view that is shrunk
+_WHY = "schedule.coarse or method.transmittance.half_size_until, and what their spectra hold"
 _LEAST_SHARE = 0.25  # of the spectrum's magnitude that the smallest pictures hold (DashGaussian)
 
 
@@ -101,7 +102,7 @@ class GrowingViews:
         if len(self.starts) == 1:
             return ()
         sizes = ", ".join(f"1/{factor} from step {step}" for step, factor in self.starts)
-        return (Decision(f"size of the views in training: {sizes}", "schedule.coarse, and what their spectra hold"),)
+        return (Decision(f"size of the views in training: {sizes}", _WHY),)
 
     def factor(self, step: int) -> int:
         """By which views are shrunk in ``step``."""

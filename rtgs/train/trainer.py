@@ -37,7 +37,7 @@ from rtgs.train.progress import Progress, SilentProgress, StepReport
 from rtgs.train.recording import History, Observer, Recorder, RunningAverages
 from rtgs.train.resolution import GrowingViews
 from rtgs.train.seeds import seed_for
-from rtgs.train.settings import WatchSettings
+from rtgs.train.settings import ScheduleSettings, WatchSettings
 from rtgs.train.view_order import OrderState, ViewOrder
 from rtgs.train.watch import Watch, look, why_idle
 
@@ -79,6 +79,8 @@ class Trainer:
         Of the order of the views.
     stage : Stage, optional
         None: the method's first.
+    views : ScheduleSettings, optional
+        When views are shrunk; None: as the method's schedule says.
     progress : Progress, optional
         Who is told how far it is; None: nobody.
     recorder : Recorder, optional
@@ -100,6 +102,7 @@ class Trainer:
         *,
         seed: int,
         stage: Stage | None = None,
+        views: ScheduleSettings | None = None,
         progress: Progress | None = None,
         recorder: Recorder | None = None,
         checkpoint_dir: Path | None = None,
@@ -118,7 +121,8 @@ class Trainer:
         self.onlooker = onlooker
         self._idle = why_idle(watch, tested=bool(scene.test), recorded=recorder is not None)
         self._watch = Watch(watch) if watch is not None and watch.on and not self._idle else None
-        self._growing = GrowingViews(scene.train, self.schedule)
+        self._own_views = views not in (None, self.schedule)
+        self._growing = GrowingViews(scene.train, views or self.schedule)
         self._order = ViewOrder(len(scene.train), seed_for(seed, "views"))
         self._averages = RunningAverages()
         self._held_out = HeldOutView(scene, self.schedule.total)
@@ -304,11 +308,12 @@ class Trainer:
         self.recorder.metrics(values, self._step)
 
     def _announce(self, resumed_from: int | None) -> None:
+        decisions = self._decisions
         if resumed_from is not None:
-            if resumed_from > self.stage.from_step:  # else it is the end of the stage before
-                self.progress.note(f"resumed from the checkpoint of step {resumed_from}")
-            return
-        for decision in self._decisions:
+            if resumed_from > self.stage.from_step:
+                return self.progress.note(f"resumed from the checkpoint of step {resumed_from}")
+            decisions = self._growing.decisions if self._own_views else ()  # the stage before has told the others
+        for decision in decisions:
             self.progress.note(f"{decision.what}: {decision.why}")
 
     def _resume(self) -> int | None:
