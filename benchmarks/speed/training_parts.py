@@ -22,6 +22,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
@@ -163,14 +164,11 @@ def stage_shares(
     method: Model, scene: Scene, seed: int, now: Callable[[], float], stage: Stage, preset_steps: int
 ) -> StageShares:
     """Train one stage of the method under the clocks; ``preset_steps``: in the schedule as it is."""
-    from rtgs.methods.plans import views_schedule
+    from rtgs.methods.views import views_schedule
     from rtgs.train.trainer import Trainer
 
     clock = PartClock(now)
-    views = None  # as in :func:`pipelines.steps.training.train_stage`
-    if stage.name == "transmittance":
-        views = views_schedule(method.settings.transmittance, method.schedule, stage.from_step)
-    trainer = Trainer(method, scene, seed=seed, stage=stage, views=views)
+    trainer = Trainer(method, scene, seed=seed, stage=stage, views=partial(views_schedule, method, stage.from_step))
     began = work_time()
     with clocks(clock), clock.part("shading"):
         trainer.run()

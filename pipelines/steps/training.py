@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict, fields
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -40,7 +41,7 @@ def train_stage(params: StageParams, context: StepContext, object_mesh: ObjectMe
     from rtgs.gaussians.ply import write_ply
     from rtgs.mesh.container import write_object_mesh
     from rtgs.methods import Stage, create_method
-    from rtgs.methods.plans import views_schedule
+    from rtgs.methods.views import views_schedule
     from rtgs.scenes.canonical import read_scene
     from rtgs.train.progress import SharedProgress, progress_for
     from rtgs.train.seeds import generator_for
@@ -50,9 +51,6 @@ def train_stage(params: StageParams, context: StepContext, object_mesh: ObjectMe
     generator = generator_for(params.seed, "initialise")
     method = create_method(params.method, scene, params.schedule, generator, object_mesh)
     stage = Stage(params.stage, params.from_step, params.until)
-    views = None
-    if object_mesh is not None:
-        views = views_schedule(params.method.transmittance, params.schedule, params.from_step)
     checkpoints = context.partial / "checkpoints"
     _start_from_stage_before(context, checkpoints)
     recorder = HistoryRecorder(context.partial / HISTORY_FILE, context.tracker)
@@ -65,7 +63,7 @@ def train_stage(params: StageParams, context: StepContext, object_mesh: ObjectMe
         scene,
         seed=params.seed,
         stage=stage,
-        views=views,
+        views=partial(views_schedule, method, params.from_step),
         progress=progress,
         recorder=recorder,
         checkpoint_dir=checkpoints,

@@ -9,8 +9,8 @@ from rtgs.train.schedule import densify_due, opacity_reset_due
 from rtgs.train.settings import ScheduleSettings
 
 
-def views_schedule(settings: TransmittanceSettings, schedule: ScheduleSettings, start: int) -> ScheduleSettings:
-    """When views are shrunk in the stage for transparent objects that begins with step ``start``: as ``schedule`` says,
+def shrunk_from(settings: TransmittanceSettings, schedule: ScheduleSettings, start: int) -> ScheduleSettings:
+    """When views are shrunk in a stage for transparent objects that begins with step ``start``: as ``schedule`` says,
     or if it shrinks none, from the beginning on as the stage's own settings say."""
     until, begin = settings.half_size_until, start / schedule.total
     if schedule.coarse > 1 or until <= begin:

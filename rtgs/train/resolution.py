@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from rtgs.scenes.scene import View
 
 LEAST_SIDE = 32  # pixels of the short side of a view that is shrunk
-_WHY = "schedule.coarse or method.transmittance.half_size_until, and what their spectra hold"
 _LEAST_SHARE = 0.25  # of the spectrum's magnitude that the smallest pictures hold (DashGaussian)
 
 
@@ -81,8 +80,14 @@ class GrowingViews:
         starts: (first step, factor): by how much views are shrunk from which step on.
     """
 
-    def __init__(self, views: Sequence[View], schedule: ScheduleSettings) -> None:
-        self._views = views
+    def __init__(
+        self,
+        views: Sequence[View],
+        schedule: ScheduleSettings,
+        why: str = "schedule.coarse, and what their spectra hold",
+    ) -> None:
+        """``why``: for the log."""
+        self._views, self._why = views, why
         self.starts: tuple[tuple[int, int], ...] = ((0, 1),)
         largest = self._largest(schedule.coarse)
         if largest > 1:
@@ -102,7 +107,7 @@ class GrowingViews:
         if len(self.starts) == 1:
             return ()
         sizes = ", ".join(f"1/{factor} from step {step}" for step, factor in self.starts)
-        return (Decision(f"size of the views in training: {sizes}", _WHY),)
+        return (Decision(f"size of the views in training: {sizes}", self._why),)
 
     def factor(self, step: int) -> int:
         """By which views are shrunk in ``step``."""

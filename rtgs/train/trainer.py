@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import platform
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -79,8 +79,9 @@ class Trainer:
         Of the order of the views.
     stage : Stage, optional
         None: the method's first.
-    views : ScheduleSettings, optional
-        When views are shrunk; None: as the method's schedule says.
+    views : callable, optional
+        Asked once the stage has begun or gone on: the schedule that says when views are shrunk. It must follow from
+        the method's settings and state, for checkpoints do not compare it. None: the method's schedule says so.
     progress : Progress, optional
         Who is told how far it is; None: nobody.
     recorder : Recorder, optional
@@ -102,7 +103,7 @@ class Trainer:
         *,
         seed: int,
         stage: Stage | None = None,
-        views: ScheduleSettings | None = None,
+        views: Callable[[], ScheduleSettings] | None = None,
         progress: Progress | None = None,
         recorder: Recorder | None = None,
         checkpoint_dir: Path | None = None,
@@ -121,8 +122,8 @@ class Trainer:
         self.onlooker = onlooker
         self._idle = why_idle(watch, tested=bool(scene.test), recorded=recorder is not None)
         self._watch = Watch(watch) if watch is not None and watch.on and not self._idle else None
-        self._own_views = views not in (None, self.schedule)
-        self._growing = GrowingViews(scene.train, views or self.schedule)
+        self._views = views
+        self._growing = GrowingViews(scene.train, self.schedule)
         self._order = ViewOrder(len(scene.train), seed_for(seed, "views"))
         self._averages = RunningAverages()
         self._held_out = HeldOutView(scene, self.schedule.total)
@@ -166,6 +167,7 @@ class Trainer:
             self._announce(resumed_from)
             if first == self.stage.from_step:
                 self._note(first, self.method.begin(self.stage))
+            self._show_as_told()
             largest = max(view.camera.width * view.camera.height for view in self.scene.train)
             with serial_torch(largest <= SERIAL_PIXELS):
                 while self._step < self.stage.until:
@@ -308,13 +310,21 @@ class Trainer:
         self.recorder.metrics(values, self._step)
 
     def _announce(self, resumed_from: int | None) -> None:
-        decisions = self._decisions
         if resumed_from is not None:
-            if resumed_from > self.stage.from_step:
-                return self.progress.note(f"resumed from the checkpoint of step {resumed_from}")
-            decisions = self._growing.decisions if self._own_views else ()  # the stage before has told the others
-        for decision in decisions:
+            if resumed_from > self.stage.from_step:  # else it is the end of the stage before
+                self.progress.note(f"resumed from the checkpoint of step {resumed_from}")
+            return
+        for decision in self._decisions:
             self.progress.note(f"{decision.what}: {decision.why}")
+
+    def _show_as_told(self) -> None:
+        """Views as the stage has them, now that it has begun."""
+        if self._views is None or (told := self._views()) == self.schedule:
+            return
+        self._growing = GrowingViews(self.scene.train, told, f"so the {self.stage.name} stage learns at less cost")
+        if self._step == self.stage.from_step:
+            for decision in self._growing.decisions:
+                self.progress.note(f"{decision.what}: {decision.why}")
 
     def _resume(self) -> int | None:
         """Load the newest checkpoint, if there is one, and return its step."""

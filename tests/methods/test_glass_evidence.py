@@ -4,6 +4,7 @@ into it; and what the third stage makes of it."""
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -19,8 +20,10 @@ from rtgs.methods import Mode, RenderOptions, Stage
 from rtgs.methods.model import Model
 from rtgs.methods.parts.glass_evidence import glass_faces, near_surface, on_surface, seen_bare
 from rtgs.methods.parts.interface_set import normal_quaternions
+from rtgs.methods.settings import MethodSettings
 from rtgs.methods.shading.mirror import SurfacePixels
 from rtgs.methods.shading.straight import glass_pixels, widened
+from rtgs.methods.views import views_schedule
 from rtgs.scenes.scene import View
 from rtgs.train.checkpoint import save_checkpoint
 from rtgs.train.trainer import Trainer
@@ -231,9 +234,26 @@ def test_a_killed_run_that_left_the_stage_out_goes_on_bit_for_bit(
     assert [name for name, tensor in expected.items() if not torch.equal(tensor, found[name])] == []
 
 
-def _with_skin(made: GlassScene) -> Model:
+def test_the_stage_sees_smaller_views_unless_it_is_left_out(plain: GlassScene, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("rtgs.train.resolution.LEAST_SIDE", 4)
+    recipe = glass_recipe()
+    recipe = replace(recipe, transmittance=replace(recipe.transmittance, half_size_until=0.6))
+    glass, opaque = new_glass_method(recipe, plain), _with_skin(plain, recipe)
+    for stage in glass.stages[:2]:
+        glass.begin(stage)
+    seen = []
+    for method in (glass, opaque):
+        asked = partial(views_schedule, method, method.stages[2].from_step)
+        trainer = Trainer(method, plain.scene, seed=3, stage=replace(method.stages[2], until=32), views=asked)
+        summary = trainer.run()
+        seen.append((trainer._growing.starts, "size of the views" in " ".join(map(str, summary.decisions))))
+    assert seen == [(((0, 1), (30, 2), (36, 1)), True), (((0, 1),), False)]
+    assert opaque.decisions[-1].what == "no transmittance stage"
+
+
+def _with_skin(made: GlassScene, recipe: MethodSettings | None = None) -> Model:
     """Before its third stage, with an opaque ball in the place of the glass one."""
-    method = new_glass_method(glass_recipe(), made)
+    method = new_glass_method(recipe or glass_recipe(), made)
     for stage in method.stages[:2]:
         method.begin(stage)
     count = len(method["base"])

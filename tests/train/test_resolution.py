@@ -10,7 +10,7 @@ import torch
 from training_cases import small_scene, small_schedule, small_trainer
 
 from rtgs.core.errors import RtgsError
-from rtgs.methods.plans import views_schedule
+from rtgs.methods.plans import shrunk_from
 from rtgs.methods.settings import TransmittanceSettings
 from rtgs.train.resolution import GrowingViews, factor_starts, shrunk, spectrum_shares
 from rtgs.train.settings import ScheduleSettings
@@ -138,25 +138,21 @@ def test_views_may_shrink_after_some_steps_on_whole_ones():
 def test_the_stage_of_glass_begins_with_views_of_half_the_size():
     schedule = small_schedule(total=100)
     until = TransmittanceSettings(half_size_until=0.6)
-    shown = views_schedule(until, schedule, 30)
+    shown = shrunk_from(until, schedule, 30)
     assert GrowingViews(larger_scene().train, shown).starts == ((0, 1), (30, 2), (60, 1))
-    assert views_schedule(until, schedule, 60) == schedule  # over before it begins
-    assert views_schedule(TransmittanceSettings(), schedule, 30) == schedule
+    assert shrunk_from(until, schedule, 60) == schedule  # over before it begins
+    assert shrunk_from(TransmittanceSettings(), schedule, 30) == schedule
     asked = small_schedule(total=100, coarse=4)
-    assert views_schedule(until, asked, 30) == asked
+    assert shrunk_from(until, asked, 30) == asked
 
 
 def test_a_trainer_shows_views_as_it_is_told():
     scene = larger_scene()
-    trainer = small_trainer(scene, schedule=small_schedule(total=4), views=small_schedule(total=4, coarse=2))
-    widths = []
-    while trainer._step < 4:
-        widths.append(trainer._growing.at(0, trainer._step).camera.width)
-        trainer._train_step()
-        trainer._between_steps()
-    whole = scene.train[0].camera.width
-    assert widths == [whole // 2, whole // 2, whole, whole]
-    assert "1/2 from step 0" in " ".join(map(str, trainer._decisions))
+    told = small_schedule(total=4, coarse=2)
+    summary = (trainer := small_trainer(scene, schedule=small_schedule(total=4), views=lambda: told)).run()
+    assert trainer._growing.starts == ((0, 2), (2, 1))
+    assert "1/2 from step 0" in " ".join(map(str, summary.decisions))
+    assert "stage learns at less cost" in " ".join(map(str, summary.decisions))
 
 
 @pytest.mark.parametrize("first", [0.0, 0.3])
