@@ -10,6 +10,7 @@ set(RTGS_KERNELS
   image/split_sum.cpp
   gaussians/mirror_light.cpp
   image/srgb.cpp
+  image/blend.cpp
   light/lookup.cpp
   light/filter.cpp
   light/features.cpp
@@ -40,6 +41,8 @@ set(RTGS_BINDINGS
   bind/mirror.cpp
   bind/split_sum.cpp
   bind/srgb.cpp
+  image/planes.cpp
+  bind/blend.cpp
   light/border.cpp
   bind/light.cpp
   bind/features.cpp

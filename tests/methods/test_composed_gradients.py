@@ -95,7 +95,8 @@ def twin_render(method: Model, base, reflection, camera, images, texels=None, ba
     if texels is not None:
         color = color + (1 - traced.alpha[:, None]) * CubemapLight(texels, settings.environment)(mirrored.directions)
     light = weight * color.T
-    change = flat.specular * light if settings.optics.weight == "additive" else specular_change(flat, light, None)
+    additive = settings.optics.weight == "additive"
+    change = flat.specular * light if additive else specular_change(flat.diffuse, flat.specular, light, None)
     change = torch.where(covered, change, 0.0)
     image = (flat.diffuse + change).reshape(3, camera.height, camera.width)
     fragile = discontinuity_mask(*shape, features, camera, options=options, bands=bands[0]).flatten()

@@ -14,7 +14,8 @@ from rtgs.methods import Mode, RenderOptions
 from rtgs.methods.model import Model
 from rtgs.methods.reads import as_lit
 from rtgs.methods.settings import MethodSettings
-from rtgs.methods.shading.lights import Light, sum_of_lights
+from rtgs.methods.shading.blend import sum_of_lights
+from rtgs.methods.shading.lights import Light
 from rtgs.methods.shading.outline import Outline, covering, with_beside
 from rtgs.optics.dielectric import wall_reflectance
 from rtgs.optics.light import decoded, encoded
@@ -56,7 +57,7 @@ def shown(side: int, cover: float = 0.9) -> tuple[Tensor, Tensor]:
     through = Light("t", "tc", none.index_copy(0, rows, 1 - reflected), color(0.1, count))
     beside = color(0.1, count).T[rows[outline.partly]]
     lights = with_beside((mirrored, through), specular, outline, beside)
-    light = specular * sum_of_lights(lights, "linear")[0] + (1 - specular) * 0.1
+    light = specular * sum_of_lights([each.weighted for each in lights], "linear")[0] + (1 - specular) * 0.1
     total = sum(each.weight for each in lights)
     assert isinstance(total, Tensor)
     return light, total
@@ -105,7 +106,7 @@ def test_gradients_are_those_of_finite_differences():
         specular = specular.index_copy(0, rows, covering(composited, outline.share, 0.9))
         weight = torch.zeros(5, dtype=torch.float64).index_copy(0, rows, outline.reflected(index)[0])
         lights = with_beside((Light("r", "rc", weight, mirrored),), specular, outline, beside)
-        return specular * sum_of_lights(lights, "linear")
+        return specular * sum_of_lights([each.weighted for each in lights], "linear")
 
     assert torch.autograd.gradcheck(light, (composited, beside, mirrored, index))
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from rtgs.methods.shading.mirror import SurfacePixels, specular_change
+from rtgs.methods.shading.mirror import specular_change
 from rtgs.native import core
 from rtgs.optics.light import decoded, decoded_twin, encoded, encoded_twin
 from rtgs.scenes.truth import srgb_from_linear
@@ -26,24 +26,20 @@ def test_gradients_are_finite_and_right_at_black_and_beyond_white():
 
 
 def test_a_half_mirror_of_white_over_black_is_half_the_light():
-    pixels = SurfacePixels(
-        torch.zeros(3, 1), torch.tensor([0.5]), torch.zeros(1), torch.zeros(1), torch.zeros(3, 1), torch.ones(1)
-    )
+    surface = torch.zeros(3, 1), torch.tensor([0.5])
     white = torch.ones(3, 1)
-    assert float(specular_change(pixels, white, None)[0]) == 0.5
-    assert abs(float(specular_change(pixels, white, None, "linear")[0]) - 0.735357) < 1e-5, "sRGB of half the light"
+    assert float(specular_change(*surface, white, None)[0]) == 0.5
+    assert abs(float(specular_change(*surface, white, None, "linear")[0]) - 0.735357) < 1e-5, "sRGB of half the light"
 
 
 def test_added_light_takes_nothing_from_the_surface_s_own():
-    pixels = SurfacePixels(
-        torch.full((3, 1), 0.5), torch.tensor([0.25]), torch.zeros(1), torch.zeros(1), torch.zeros(3, 1), torch.ones(1)
-    )
+    surface = torch.full((3, 1), 0.5), torch.tensor([0.25])
     light = torch.full((3, 1), 0.8)
-    assert float(specular_change(pixels, light, None, additive=True)[0]) == pytest.approx(0.25 * 0.8)
-    assert float(specular_change(pixels, light, None)[0]) == pytest.approx(0.25 * (0.8 - 0.5))
+    assert float(specular_change(*surface, light, None, additive=True)[0]) == pytest.approx(0.25 * 0.8)
+    assert float(specular_change(*surface, light, None)[0]) == pytest.approx(0.25 * (0.8 - 0.5))
     own = float(decoded_twin(torch.tensor(0.5)))
     sum_of_both = float(encoded_twin(torch.tensor(own + 0.25 * 0.8)))
-    assert float(specular_change(pixels, light, None, "linear", additive=True)[0]) == pytest.approx(sum_of_both - 0.5)
+    assert float(specular_change(*surface, light, None, "linear", additive=True)[0]) == pytest.approx(sum_of_both - 0.5)
 
 
 @pytest.mark.parametrize("blend", ["srgb", "linear"])
@@ -54,8 +50,7 @@ def test_gradients_of_the_mixture_are_those_of_finite_differences(blend: str, ad
     specular = 0.1 + 0.8 * torch.rand(4, generator=generator, dtype=torch.float64)
 
     def change(diffuse: torch.Tensor, specular: torch.Tensor, light: torch.Tensor) -> torch.Tensor:
-        pixels = SurfacePixels(diffuse, specular, specular, specular, diffuse, specular)
-        return specular_change(pixels, light, None, blend, additive=additive) + 0 * diffuse
+        return specular_change(diffuse, specular, light, None, blend, additive=additive) + 0 * diffuse
 
     given = [each.requires_grad_() for each in (diffuse, specular, light)]
     assert torch.autograd.gradcheck(change, given, eps=1e-7, atol=1e-6)

@@ -15,8 +15,9 @@ import torch
 from torch import Tensor
 
 from rtgs.methods.parts.part import Frame, Raster
-from rtgs.methods.shading.mirror import SurfacePixels, specular_change
-from rtgs.methods.shading.pixel_maps import full_map, full_view, surface_layers
+from rtgs.methods.shading.blend import Blend, blended
+from rtgs.methods.shading.mirror import SurfacePixels
+from rtgs.methods.shading.pixel_maps import full_map, surface_layers
 from rtgs.methods.shading.traced_pixels import TracedPixels
 from rtgs.optics.light import decoded, encoded
 from rtgs.optics.settings import OpticsSettings
@@ -33,6 +34,11 @@ class Light:
     color: Tensor  # (3, P) C, in the encoding of the photos
     parts: Mapping[str, Tensor] = field(default_factory=dict)  # (3, P) linear light: C by where it is from
 
+    @property
+    def weighted(self) -> tuple[Tensor, Tensor]:
+        """w and C."""
+        return self.weight, self.color
+
 
 @dataclass(frozen=True)
 class Traced:
@@ -45,12 +51,6 @@ class Traced:
     maps: Mapping[str, Tensor] = field(default_factory=dict)  # more maps of the view
     kept: object = None  # for loss terms
     observations: tuple[Observation, ...] = ()
-
-
-def sum_of_lights(lights: Sequence[Light], blend: str) -> Tensor:
-    """(3, P) sum of w C, linear light with ``blend`` "linear"."""
-    first, *others = (light.weight * decoded(light.color, blend) for light in lights)
-    return sum(others, first)
 
 
 def mean_of_lights(samples: Sequence[Sequence[Light]]) -> tuple[Light, ...]:
@@ -76,8 +76,10 @@ def mean_of_lights(samples: Sequence[Sequence[Light]]) -> tuple[Light, ...]:
 def lit_view(frame: Frame, raster: Raster, traced: Traced, optics: OpticsSettings) -> RenderedView:
     """The view with its lights; the image of pixels that were not traced is C_d."""
     camera, flat, chosen, pixels, blend = frame.camera, traced.flat, traced.chosen, traced.pixels, optics.blend
-    lights = sum_of_lights(traced.lights, blend)
-    change = specular_change(pixels, lights, chosen.emphasis, blend, additive=optics.additive)
+    lights = [light.weighted for light in traced.lights]
+    image = blended(
+        flat.diffuse, pixels.specular, lights, chosen.index, chosen.emphasis, Blend(blend, optics.additive)
+    )
     shape = (3, camera.height, camera.width)
     layers = None
     if frame.options.layers:
@@ -96,7 +98,7 @@ def lit_view(frame: Frame, raster: Raster, traced: Traced, optics: OpticsSetting
                 layers[name] = full_map(shown.detach(), chosen, shape)
     return RenderedView(
         camera,
-        full_view(flat.diffuse, chosen, change, shape),
+        image.reshape(shape),
         raster.buffers,
         layers,
         {"specular": flat.specular.reshape(shape[1:]), **traced.maps},

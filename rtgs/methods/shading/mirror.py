@@ -120,21 +120,28 @@ def showing_reflection(pixels: SurfacePixels, view: Tensor, optics: OpticsSettin
 
 
 def specular_change(
-    pixels: SurfacePixels, light: Tensor, emphasis: Tensor | None, blend: str = "srgb", *, additive: bool = False
+    diffuse: Tensor,
+    specular: Tensor,
+    light: Tensor,
+    emphasis: Tensor | None,
+    blend: str = "srgb",
+    *,
+    additive: bool = False,
 ) -> Tensor:
     """(3, P) what traced light adds to C_d: k_s (light - C_d), so that C_d plus it is (1 - k_s) C_d + k_s light.
 
     ``additive``: k_s light, so that it is C_d + k_s light.
 
-    ``light`` (3, P): w_r C_r, and w_t C_t where the pixel shows a transparent object. With ``blend`` "linear" it is
-    linear light, and so is the mixture, which is encoded afterwards.
+    ``diffuse`` (3, P) and ``specular`` (P,) are C_d and k_s. ``light`` (3, P): w_r C_r, and w_t C_t where the pixel
+    shows a transparent object. With ``blend`` "linear" it is linear light, and so is the mixture, which is encoded
+    afterwards.
     ``emphasis`` (P,) multiplies the gradient and leaves the value alone: 1 / share for pixels drawn with that share
     makes the gradient of every parameter right on average (docs/reflection.md).
     """
-    diffuse = decoded(pixels.diffuse, blend)
-    change = pixels.specular * (light if additive else light - diffuse)
+    base = decoded(diffuse, blend)
+    change = specular * (light if additive else light - base)
     if blend != "srgb":
-        change = encoded(diffuse + change, blend) - pixels.diffuse
+        change = encoded(base + change, blend) - diffuse
     return change if emphasis is None else _Emphasize.apply(change, emphasis)  # type: ignore[return-value]
 
 

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from rtgs.methods.shading.mirror import SurfacePixels
 from rtgs.methods.shading.traced_pixels import TracedPixels
+from rtgs.native import core
+from rtgs.native.threads import threads
 
 
 def full_map(values: Tensor, chosen: TracedPixels, shape) -> Tensor:
@@ -14,15 +19,17 @@ def full_map(values: Tensor, chosen: TracedPixels, shape) -> Tensor:
     return torch.zeros(3, shape[1] * shape[2]).index_copy(1, chosen.index, values).reshape(shape)
 
 
-def full_view(diffuse: Tensor, chosen: TracedPixels, change: Tensor, shape) -> Tensor:
-    """The image: C_d (3, H * W) with the ``change`` (3, P) of the traced pixels."""
-    return diffuse.index_add(1, chosen.index, change).reshape(shape)
-
-
 def take_pixels(pixels: SurfacePixels, index: Tensor) -> SurfacePixels:
-    """The pixels of an index (P,)."""
-    rows = (getattr(pixels, name) for name in ("diffuse", "specular", "roughness", "f0", "normal", "depth"))
-    return SurfacePixels(*(row.index_select(-1, index) for row in rows))
+    """The pixels of an index (P,), none twice."""
+    maps = (pixels.diffuse, pixels.specular, pixels.roughness, pixels.f0, pixels.normal, pixels.depth)
+    return SurfacePixels(*taken(maps, index))
+
+
+def taken(maps: Sequence[Tensor], index: Tensor) -> tuple[Tensor, ...]:
+    """(..., P) of each of the maps (..., N) at the index (P,) int64, none twice; any dtype, float32 natively."""
+    if all(each.dtype == torch.float32 and each.device.type == "cpu" for each in maps):
+        return _Taken.apply(index, *maps)  # type: ignore[return-value]
+    return tuple(each.index_select(-1, index) for each in maps)
 
 
 def surface_layers(flat: SurfacePixels, chosen: TracedPixels, shape) -> dict[str, Tensor]:
@@ -36,3 +43,31 @@ def surface_layers(flat: SurfacePixels, chosen: TracedPixels, shape) -> dict[str
         "f0": flat.f0.reshape(*flat.f0.shape[:-1], *shape[1:]),
         "traced": traced.reshape(shape[1:]),
     }
+
+
+class _Taken(torch.autograd.Function):
+    """Rows of all maps at once; the gradient of a map is put together without adding, for no pixel is taken twice."""
+
+    @staticmethod
+    def forward(ctx, index: Tensor, *maps: Tensor) -> tuple[Tensor, ...]:
+        given = [each.detach().contiguous() for each in maps]
+        rows = tuple(each.new_empty(*each.shape[:-1], len(index)) for each in given)
+        size = given[0].shape[-1]
+        core.take_planes(index.numpy(), size, [each.numpy() for each in given], [r.numpy() for r in rows], threads())
+        ctx.save_for_backward(index)
+        ctx.shapes = [each.shape for each in given]
+        ctx.set_materialize_grads(False)
+        return rows
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, *upstream: Tensor | None):  # type: ignore[override]
+        (index,) = ctx.saved_tensors
+        pairs = zip(ctx.shapes, upstream, ctx.needs_input_grad[1:], strict=True)
+        maps = [torch.empty(shape) if needed and given is not None else None for shape, given, needed in pairs]
+        used = [(each, given) for each, given in zip(maps, upstream, strict=True) if each is not None]
+        if used:
+            rows = [given.contiguous().numpy() for _, given in used]  # type: ignore[union-attr]
+            size = ctx.shapes[0][-1]
+            core.put_planes(index.numpy(), size, rows, [each.numpy() for each, _ in used], threads())
+        return None, *maps

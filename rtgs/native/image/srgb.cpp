@@ -4,32 +4,10 @@
 #include "image/srgb.h"
 
 #include "common/rows.h"
+#include "image/srgb_curve.h"
 
 namespace rtgs::RTGS_ISA {
 namespace {
-
-constexpr float kDarkColor = 0.04045f, kDarkLight = 0.0031308f, kSlope = 12.92f, kOffset = 0.055f, kPower = 2.4f;
-
-// a normal and above 0; at most 2^126
-inline vfloat power(vfloat a, float exponent) { return exp2_response(min(exponent * log2(a), broadcast(126.f))); }
-inline vfloat decode_base(vfloat color) { return (max(color, broadcast(kDarkColor)) + kOffset) * (1 / (1 + kOffset)); }
-
-// The line is the other case of "brighter than", so that it hands NaN on.
-inline vfloat decoded(vfloat color) {
-  return select(gt(color, broadcast(kDarkColor)), power(decode_base(color), kPower), color * (1 / kSlope));
-}
-inline vfloat encoded(vfloat light) {
-  const vfloat bright = (1 + kOffset) * power(max(light, broadcast(kDarkLight)), 1 / kPower) - kOffset;
-  return select(gt(light, broadcast(kDarkLight)), bright, light * kSlope);
-}
-inline vfloat decode_slope(vfloat color) {
-  const vfloat bright = (kPower / (1 + kOffset)) * power(decode_base(color), kPower - 1);
-  return select(gt(color, broadcast(kDarkColor)), bright, broadcast(1 / kSlope));
-}
-inline vfloat encode_slope(vfloat light) {
-  const vfloat bright = ((1 + kOffset) / kPower) * power(max(light, broadcast(kDarkLight)), 1 / kPower - 1);
-  return select(gt(light, broadcast(kDarkLight)), bright, broadcast(kSlope));
-}
 
 constexpr int64_t kWorthThreads = 16384;
 

@@ -1,0 +1,55 @@
+// Traced lights blended into the picture, and planes of the picture taken at some of its pixels. Twins:
+// rtgs/methods/shading/blend.py, rtgs/methods/shading/pixel_maps.py.
+#pragma once
+#include <cstdint>
+
+namespace rtgs {
+
+constexpr int kMostLights = 8;
+
+// Of N pixels of a picture P are traced; `index` (P) says which, none twice, each in 0 .. N - 1.
+struct TracedIndex {
+  int64_t pixels, count;  // N, P
+  const int64_t* index;
+  int threads;
+};
+
+struct BlendedLight {
+  float* weight;      // (P), or (3, P)
+  int weight_planes;  // 1 or 3
+  float* color;       // (3, P), encoded
+};
+// Or where their gradients go; a null pointer: nowhere.
+struct BlendedPixels {
+  float *diffuse, *specular;  // (3, N), encoded; (P)
+  BlendedLight lights[kMostLights];
+};
+struct BlendRules {
+  int lights;
+  bool linear, additive;
+  const float* emphasis;  // (P) factor of the gradient by what lights change; null: 1
+};
+
+// Values of planes[k] (N) at the index to rows[k] (P); or back, where no pixel is traced 0.
+struct PixelPlanes {
+  int count;
+  float* const* planes;
+  float* const* rows;  // put_planes: a null pointer stands for zeros
+};
+void take_planes(const TracedIndex&, const PixelPlanes&);
+void put_planes(const TracedIndex&, const PixelPlanes&);
+
+#define RTGS_DECLARE_BLEND_KERNELS(isa)                                                                        \
+  namespace isa {                                                                                              \
+  void blend_lights(const TracedIndex&, const BlendRules&, const BlendedPixels&, float* image);                \
+  void blend_lights_backward(const TracedIndex&, const BlendRules&, const BlendedPixels&, const float* upstream, \
+                             const BlendedPixels& gradients);                                                  \
+  }
+RTGS_DECLARE_BLEND_KERNELS(portable)
+#if defined(__x86_64__)
+RTGS_DECLARE_BLEND_KERNELS(avx2)
+RTGS_DECLARE_BLEND_KERNELS(avx512)
+#endif
+#undef RTGS_DECLARE_BLEND_KERNELS
+
+}  // namespace rtgs
