@@ -115,15 +115,22 @@ class Camera:
 
     def camera_rays(self, dtype: torch.dtype = torch.float32) -> Tensor:
         """(H, W, 3) rays through the pixel centres in the camera frame, z component 1."""
-        x = (torch.arange(self.width, dtype=torch.float64) + 0.5 - self.cx) / self.fx
-        y = (torch.arange(self.height, dtype=torch.float64) + 0.5 - self.cy) / self.fy
+        x, y = self._slopes()
         grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
         return torch.stack((grid_x, grid_y, torch.ones_like(grid_x)), dim=-1).to(dtype)
 
     def rays(self, dtype: torch.dtype = torch.float32) -> Rays:
         """Rays through the pixel centres in the world frame."""
-        directions = self.camera_rays(torch.float64) @ self.rotation  # R^T d for each row
+        x, y = self._slopes()
+        right, down, ahead = self.rotation  # R^T d, row by row and column by column
+        directions = x[:, None] * right + (y[:, None] * down + ahead)[:, None]
         return Rays(self.center.to(dtype), directions.to(dtype))
+
+    def _slopes(self) -> tuple[Tensor, Tensor]:
+        """(W,) and (H,) float64 x / z of the columns' centres and y / z of the rows', in the camera frame."""
+        x = (torch.arange(self.width, dtype=torch.float64) + 0.5 - self.cx) / self.fx
+        y = (torch.arange(self.height, dtype=torch.float64) + 0.5 - self.cy) / self.fy
+        return x, y
 
     def resized(self, width: int, height: int) -> Camera:
         """The same camera for the image resized to ``width`` x ``height`` (area averaging keeps pixel edges)."""

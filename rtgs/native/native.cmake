@@ -43,6 +43,8 @@ set(RTGS_BINDINGS
   bind/srgb.cpp
   image/planes.cpp
   bind/blend.cpp
+  image/traced_pixels.cpp
+  bind/traced_pixels.cpp
   light/border.cpp
   bind/light.cpp
   bind/features.cpp

@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 
 from rtgs.methods.settings import TracedShareSettings
-from rtgs.methods.shading.traced_pixels import choose_pixels, share_rays, tile_order
+from rtgs.methods.shading.traced_pixels import (
+    Share,
+    choose_pixels,
+    ordered_pixels,
+    ordered_pixels_twin,
+    tile_order,
+)
+from rtgs.native import core
 
 
 @pytest.mark.parametrize(("width", "height", "tile"), [(16, 8, 8), (13, 7, 4), (5, 3, 8), (40, 30, 16)])
@@ -93,7 +101,48 @@ def test_pixels_below_the_border_share_the_ray_of_one_of_them_and_each_gets_its_
     assert choose_pixels(surface, showing, settings, None).shared is None
 
 
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (2, 3), (13, 7), (40, 30), (64, 48)])
+@pytest.mark.parametrize("some", [False, True])
+@pytest.mark.parametrize("turn", [None, 0, 1, 3])
+def test_native_pixels_and_rays_are_those_of_the_twin(width: int, height: int, some: bool, turn: int | None):
+    generator, pixels = torch.Generator().manual_seed(width), width * height
+    order = tile_order(width, height, 8)
+    for filled in (0.0, 0.5, 0.97, 1.0):
+        surface, showing = torch.rand(pixels, generator=generator) < filled, torch.rand(pixels, generator=generator)
+        showing[::11] = torch.nan
+        kept = torch.rand(pixels, generator=generator) < 0.7 if some else None
+        share = None if turn is None else Share(showing, 0.6, turn)
+        found, exact = (each(order, surface, kept, share) for each in (ordered_pixels, ordered_pixels_twin))
+        assert torch.equal(found.index, exact.index)
+        assert (found.shared is None) == (exact.shared is None) == (turn is None)
+        if found.shared is not None and exact.shared is not None:
+            assert torch.equal(found.shared.own, exact.shared.own)
+            assert torch.equal(found.shared.ray, exact.shared.ray)
+
+
 def test_no_pixels_share_no_rays():
-    nothing = torch.empty(0, dtype=torch.int64)
-    shared = share_rays(nothing.bool(), nothing, nothing)
-    assert len(shared.own) == len(shared.ray) == 0
+    nothing = ordered_pixels(tile_order(4, 4, 8), torch.zeros(16, dtype=torch.bool), None, Share(torch.zeros(16), 1, 0))
+    assert len(nothing.index) == 0
+    assert nothing.shared is not None
+    assert len(nothing.shared.own) == len(nothing.shared.ray) == 0
+
+
+def test_the_native_order_refuses_what_does_not_fit():
+    order = tile_order(4, 2, 8)
+    index, quad, corner = (each.numpy() for each in (order.index, order.quad, order.corner))
+    with pytest.raises(ValueError, match="index holds 8, which is not in"):
+        core.PixelOrder(index + 1, quad, corner)
+    with pytest.raises(ValueError, match="corner holds 4"):
+        core.PixelOrder(index, quad, corner + 1)
+    with pytest.raises(ValueError, match="quad holds 3 numbers, expected 8"):
+        core.PixelOrder(index, quad[:3], corner)
+    rows, places = np.zeros(9, np.int64), np.zeros(9, np.int32)
+    with pytest.raises(ValueError, match="surface holds 7 numbers, expected 8"):
+        order.native.choose(np.ones(7, bool), None, rows, places)
+    with pytest.raises(ValueError, match="index holds 8 numbers, expected 9"):
+        order.native.choose(np.ones(8, bool), None, rows[:8], places)
+    showing = np.zeros(8, np.float32)
+    with pytest.raises(ValueError, match="place holds 8, which is not in"):
+        order.native.share(8, rows, places + 8, showing, 1.0, 0, rows.copy(), rows.copy())
+    with pytest.raises(ValueError, match="more are chosen"):
+        order.native.share(9, rows, places, showing, 1.0, 0, rows.copy(), rows.copy())

@@ -104,4 +104,13 @@ def _given(index: Tensor, emphasis: Tensor | None, blend: Blend, maps: Sequence[
     diffuse, specular, *lights = (each.numpy() for each in maps)
     half = len(lights) // 2
     factor = None if emphasis is None else emphasis.contiguous().numpy()
-    return index.numpy(), diffuse, specular, lights[:half], lights[half:], factor, blend.space == "linear", blend.additive
+    return (
+        index.numpy(),
+        diffuse,
+        specular,
+        lights[:half],
+        lights[half:],
+        factor,
+        blend.space == "linear",
+        blend.additive,
+    )

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 
 import torch
 from torch import Tensor
 
 from rtgs.methods.settings import TracedShareSettings
+from rtgs.native import core
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,11 @@ class TileOrder:
     quad: Tensor  # (H * W,) int64 number of the 2x2 block of each
     corner: Tensor  # (H * W,) int64 place in it, 0 .. 3
 
+    @cached_property
+    def native(self) -> core.PixelOrder:
+        """The same for the native core."""
+        return core.PixelOrder(self.index.numpy(), self.quad.numpy(), self.corner.numpy())
+
 
 @lru_cache(maxsize=16)
 def tile_order(width: int, height: int, tile: int) -> TileOrder:
@@ -55,6 +61,15 @@ def tile_order(width: int, height: int, tile: int) -> TileOrder:
     return TileOrder(order, tile_of, columns * -(-height // tile), quad_of, corner_of)
 
 
+@dataclass(frozen=True)
+class Share:
+    """Which pixels share a ray: those that show less than ``below``; ``turn`` says whose is traced."""
+
+    showing: Tensor  # (H * W,) float32
+    below: float
+    turn: int
+
+
 def choose_pixels(
     surface: Tensor, showing: Tensor | None, settings: TracedShareSettings, generator: torch.Generator | None
 ) -> TracedPixels:
@@ -69,42 +84,64 @@ def choose_pixels(
             rest is left out, and no ray is shared.
     """
     height, width = surface.shape
-    order = tile_order(width, height, settings.tile)
-    wanted = surface.flatten().index_select(0, order.index)
+    order, there = tile_order(width, height, settings.tile), surface.flatten()
     if showing is None:
-        return TracedPixels(order.index[wanted], None)
-    shown = showing.flatten().index_select(0, order.index)
-    high = shown >= settings.threshold
+        return ordered_pixels(order, there, None, None)
+    high = kept = None
+    if settings.threshold > 0:
+        high = kept = showing.flatten().index_select(0, order.index) >= settings.threshold
     if generator is None:
-        return TracedPixels(order.index[wanted & high], None)
-    if settings.threshold > 0:
+        return ordered_pixels(order, there, kept, None)
+    if high is not None:
         drawn = torch.rand(order.tiles, generator=generator) < settings.share
-        wanted = wanted & (high | drawn.index_select(0, order.tile))
-    chosen = wanted.nonzero()[:, 0]
-    index, emphasis, shared = order.index.index_select(0, chosen), None, None
-    if settings.threshold > 0:
-        emphasis = torch.where(high.index_select(0, chosen), 1.0, 1 / settings.share)
+        kept = high | drawn.index_select(0, order.tile)
+    share = None
     if settings.shared_below > 0:
-        turn = (order.corner.index_select(0, chosen) + int(torch.randint(4, (), generator=generator))) % 4
-        sharing = shown.index_select(0, chosen) < settings.shared_below
-        shared = share_rays(sharing, order.quad.index_select(0, chosen), turn)
-    return TracedPixels(index, emphasis, shared)
+        share = Share(showing.flatten(), settings.shared_below, int(torch.randint(4, (), generator=generator)))
+    chosen = ordered_pixels(order, there, kept, share)
+    if high is None:
+        return chosen
+    shown = showing.flatten().index_select(0, chosen.index)
+    return replace(chosen, emphasis=torch.where(shown >= settings.threshold, 1.0, 1 / settings.share))
 
 
-def share_rays(sharing: Tensor, quad: Tensor, turn: Tensor) -> SharedRays:
-    """One ray for the sharing pixels of each 2x2 block: that of the pixel whose turn comes first.
+def ordered_pixels(order: TileOrder, surface: Tensor, kept: Tensor | None, share: Share | None) -> TracedPixels:
+    """The pixels on the surface that are kept, in their order, and who shares a ray; by the native core.
 
     Args:
-        sharing: (P,) bool; the others keep a ray of their own.
-        quad: (P,) number of the block of each pixel, none below 0.
-        turn: (P,) 0 .. 3, no two pixels of a block the same.
+        order: of the image.
+        surface: (H * W,) bool, row by row.
+        kept: (H * W,) bool, in the order; None: all.
+        share: None: every pixel has a ray of its own.
     """
+    pixels = len(order.index)
+    index, place = torch.empty(pixels + 1, dtype=torch.int64), torch.empty(pixels + 1, dtype=torch.int32)
+    flags = None if kept is None else kept.contiguous().numpy()
+    count = order.native.choose(surface.contiguous().numpy(), flags, index.numpy(), place.numpy())
+    if share is None:
+        return TracedPixels(index[:count], None)
+    own, ray = torch.empty_like(index), torch.empty_like(index)
+    given = (index.numpy(), place.numpy(), share.showing.contiguous().numpy(), share.below, share.turn)
+    rays = order.native.share(count, *given, own.numpy(), ray.numpy())
+    return TracedPixels(index[:count], None, SharedRays(own[:rays], ray[:count]))
+
+
+def ordered_pixels_twin(order: TileOrder, surface: Tensor, kept: Tensor | None, share: Share | None) -> TracedPixels:
+    """:func:`ordered_pixels` in plain torch."""
+    wanted = surface.index_select(0, order.index)
+    chosen = (wanted if kept is None else wanted & kept).nonzero()[:, 0]
+    index = order.index.index_select(0, chosen)
+    if share is None:
+        return TracedPixels(index, None)
+    sharing = share.showing.index_select(0, index) < share.below
+    quad = order.quad.index_select(0, chosen)
+    turn = torch.where(sharing, (order.corner.index_select(0, chosen) + share.turn) % 4, 4)
     blocks = int(quad.max()) + 1 if len(quad) else 0
-    turn = torch.where(sharing, turn, 4)
     first = turn.new_full((blocks,), 4).scatter_reduce_(0, quad, turn, "amin")
     leads = sharing & (turn == first.index_select(0, quad))
     own = ~sharing | leads
     ray = own.cumsum(0) - 1
     led = leads.nonzero()[:, 0]
     of_block = ray.new_zeros(blocks).scatter_(0, quad.index_select(0, led), ray.index_select(0, led))
-    return SharedRays(own.nonzero()[:, 0], torch.where(sharing, of_block.index_select(0, quad), ray))
+    ray = torch.where(sharing, of_block.index_select(0, quad), ray)
+    return TracedPixels(index, None, SharedRays(own.nonzero()[:, 0], ray))
