@@ -4,9 +4,10 @@ The whole training runs, every stage, as ``rtgs run`` would train it, with a clo
 rasteriser, the tracer, its tree, activation of parameters, losses, Adam, density control. What is left is ``shading``:
 pixels to rays, microfacet weights, blend, autograd, the loop. ``fixed``: how much of all is Python and calls, by a step
 on a picture 16 pixels wide and some hundred surfels. A part's clock stops while a part inside of it runs, so shares add
-up to 1. Seconds are CPU seconds of one thread; with ``--threads 2`` wall seconds. Where the scene's masks show a
-transparent object its mesh is made before the third stage, as the pipeline makes it; its time counts in the whole.
-A Markdown table, then a JSON object as the last line.
+up to 1. Seconds are CPU seconds of one thread; with ``--threads 2`` or ``--wall`` wall seconds. Where the scene's masks
+show a transparent object its mesh is made before the third stage, as the pipeline makes it; its time counts in the
+whole. ``--mesh FOLDER`` reads it instead, from what ``rtgs.mesh.container.write_object_mesh`` wrote: an artifact of the
+step ``extract_mesh``, say. A Markdown table, then a JSON object as the last line.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +32,7 @@ import torch
 
 from benchmarks.common.machine import machine
 from benchmarks.common.training_runs import schedule_overrides
+from rtgs.core.errors import RtgsError
 from rtgs.core.work_time import work_time
 
 if TYPE_CHECKING:
@@ -230,9 +233,17 @@ def fixed_seconds(method: Model, scene: Scene, stage: Stage, now: Callable[[], f
     return median(times)
 
 
-def measure(words: Sequence[str], shrunk: Sequence[str], threads: int) -> Training:
-    """Compose, load, train under the clocks, every stage; ``shrunk``: the words that shorten the schedule."""
+def measure(
+    words: Sequence[str], shrunk: Sequence[str], threads: int, wall: bool = False, given: Path | None = None
+) -> Training:
+    """Compose, load, train under the clocks, every stage; ``shrunk``: the words that shorten the schedule; ``wall``:
+    seconds by the wall on one thread too; ``given``: the folder of the transparent object's mesh.
+
+    Raises:
+        RtgsError: there is no mesh in the folder, or no stage that wants it.
+    """
     from rtgs.config.compose import compose
+    from rtgs.mesh.container import read_object_mesh
     from rtgs.mesh.silhouettes import why_unbounded
     from rtgs.methods import create_method, find_method
     from rtgs.scenes.scene import load_scene
@@ -243,21 +254,24 @@ def measure(words: Sequence[str], shrunk: Sequence[str], threads: int) -> Traini
     whole = compose(list(words))[0]
     scene = replace(load_scene(config.scene), test=())
     transparent = not why_unbounded([view.mask for view in scene.train])
-    clock = time.thread_time if threads == 1 else time.perf_counter
+    clock = time.thread_time if threads == 1 and not wall else time.perf_counter
+    mesh = None if given is None else read_object_mesh(given)
 
     def new(mesh: ObjectMesh | None = None) -> Model:
         generator = generator_for(config.seed, "initialise")
         return create_method(config.method, scene, config.schedule, generator, mesh)
 
-    both = (
+    both = [
         find_method(one.method.name).timeline(one.method, one.schedule, transparent=transparent)
         for one in (config, whole)
-    )
+    ]
+    if mesh is not None and "transmittance" not in [stage.name for stage in both[0]]:
+        raise RtgsError(f"--mesh {given}: this training has no stage for glass, which alone takes a mesh")
     method, found, times = new(), [], (0.0, 0.0)
     for stage, complete in zip(*both, strict=True):
         if stage.name == "transmittance":
             start = clock(), work_time()
-            third = new(found_mesh(method, stage.from_step, scene, config))
+            third = new(mesh or found_mesh(method, stage.from_step, scene, config))
             third.load({name: tensor.clone() for name, tensor in method.state().items()})
             times, method = (clock() - start[0], work_time() - start[1]), third
         steps = complete.until - complete.from_step
@@ -301,14 +315,17 @@ def main() -> None:
     parser.add_argument("--steps", type=int, help="shrink the preset's schedule")
     parser.add_argument("--set", nargs="*", default=[], help="config words")
     parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--wall", action="store_true", help="seconds by the wall with one thread too")
+    parser.add_argument("--mesh", type=Path, metavar="FOLDER", help="read the transparent object's mesh from there")
     options = parser.parse_args()
     words = [f"scene={options.scene}", f"method={options.method}", f"preset={options.preset}", *options.set]
     shrunk = shrunk_words(options.steps, words) if options.steps else []
-    training = measure(words, shrunk, options.threads)
+    training = measure(words, shrunk, options.threads, options.wall, options.mesh)
     stages, (minutes, cpu_minutes) = training.stages, training.minutes()
     extrapolated = any(stage.steps != stage.preset_steps for stage in stages)
     print(table(stages))
-    kind = "CPU, one thread" if options.threads == 1 else f"by the clock, {options.threads} threads"
+    clock = "CPU" if options.threads == 1 and not options.wall else "by the clock"
+    kind = f"{clock}, " + ("one thread" if options.threads == 1 else f"{options.threads} threads")
     source = "extrapolated from milliseconds a step" if extrapolated else "measured"
     if training.mesh_seconds:
         print(f"\nThe object's mesh: {training.mesh_seconds:.1f} s.")

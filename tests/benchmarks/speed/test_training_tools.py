@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import math
+import time
+from pathlib import Path
 
 import pytest
 
 from benchmarks.speed import train_step, training_parts, transmittance_step
+from rtgs.core.errors import RtgsError
+from rtgs.mesh.container import ObjectMesh, write_object_mesh
+from tests.mesh.shapes import sphere
 
 
 def test_train_step(run) -> None:
@@ -56,6 +61,22 @@ def test_training_parts_of_a_glass_scene_holds_mesh_and_third_stage(run) -> None
     assert figures["mesh_seconds"] > 0
     trained = sum(stage["seconds"] * stage["preset_steps"] / stage["steps"] for stage in figures["stages"])
     assert figures["minutes"] == pytest.approx((trained + figures["mesh_seconds"]) / 60, abs=1e-3)
+
+
+def test_training_parts_by_the_wall_on_one_thread(run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(time, "thread_time", lambda: pytest.fail("CPU seconds"))
+    words = ("--preset", "smoke", "--steps", "24", "--set", "scene.long_side=48", "method.reflection.matte.probation=0")
+    figures = run(training_parts, "--scene", "spheres", "--wall", *words)
+    assert all(stage["seconds"] > 0.9 * stage["cpu_seconds"] for stage in figures["stages"])
+
+
+def test_training_parts_refuses_a_mesh_that_no_stage_takes_or_that_is_not_there(run, tmp_path: Path) -> None:
+    words = ("--preset", "smoke", "--steps", "20", "--set", "scene.long_side=48")
+    with pytest.raises(RtgsError, match=r"mesh\.json"):
+        run(training_parts, "--scene", "ball_statue", "--mesh", str(tmp_path), *words)
+    write_object_mesh(tmp_path, ObjectMesh(sphere(0.5, 12), "given", 0.02, flat=False))
+    with pytest.raises(RtgsError, match="no stage for glass"):
+        run(training_parts, "--scene", "spheres", "--mesh", str(tmp_path), *words)
 
 
 def test_transmittance_step(run) -> None:
