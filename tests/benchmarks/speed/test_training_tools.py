@@ -58,9 +58,23 @@ def test_training_parts_of_a_glass_scene_holds_mesh_and_third_stage(run) -> None
     assert {"base", "reflection", "transmittance", "interface"} == set(third["surfels"])
     assert third["rays"] > figures["stages"][1]["rays"], "straight rays besides"
     assert third["fixed"] > 0
+    assert third["shares"]["once"] > 0
     assert figures["mesh_seconds"] > 0
     trained = sum(stage["seconds"] * stage["preset_steps"] / stage["steps"] for stage in figures["stages"])
     assert figures["minutes"] == pytest.approx((trained + figures["mesh_seconds"]) / 60, abs=1e-3)
+
+
+def test_what_is_done_once_keeps_its_parts_to_itself() -> None:
+    ticks = iter(range(100))
+    clock = training_parts.PartClock(lambda: float(next(ticks)))
+    with clock.part("shading"), clock.part("once"):
+        with clock.part("trace"), clock.part("once"):
+            pass
+        with clock.part("raster"):
+            pass
+    with clock.part("raster"):
+        pass
+    assert dict(clock.seconds) == {"shading": 2, "once": 1, "raster": 1}
 
 
 def test_training_parts_by_the_wall_on_one_thread(run, monkeypatch: pytest.MonkeyPatch) -> None:
