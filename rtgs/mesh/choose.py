@@ -21,6 +21,7 @@ from rtgs.mesh.silhouettes import MaskSet, SilhouetteScore, direction_spread, si
 from rtgs.mesh.smoothing import volume
 from rtgs.mesh.surface import find_surface
 from rtgs.mesh.triangles import TriangleMesh, read_mesh_obj, read_mesh_ply
+from rtgs.native.threads import serial_torch
 
 _REMEDY = (
     "mask it in more photos, give its mesh (mesh.source=given), or train without the third stage (ablation=two_stages)"
@@ -159,14 +160,15 @@ def choose_object_mesh(
     refuse_unknown("mesh.source", source, MeshSource)
     tried = _Candidates(masks, settings, fuse, panes)
     make = {"hull": _hull_or_pane, "auto": _automatic}.get(source, lambda found: getattr(found, _MADE[source])())
-    try:
-        mesh = make(tried)
-    except RtgsError as error:
-        if source != "hull":
-            raise
-        raise RtgsError(f"{error}: {_REMEDY}") from error
-    if mesh.source == "hull" and not mesh.flat and settings.surface.fit != "carved":
-        mesh = tried.smoothed(mesh)
+    with serial_torch():  # thousands of small operations, which several threads make slower
+        try:
+            mesh = make(tried)
+        except RtgsError as error:
+            if source != "hull":
+                raise
+            raise RtgsError(f"{error}: {_REMEDY}") from error
+        if mesh.source == "hull" and not mesh.flat and settings.surface.fit != "carved":
+            mesh = tried.smoothed(mesh)
     about = f"{len(masks.views)} masks, {masks.cut} cut by the image border"
     left = [f"{masks.without} views have no mask", f"{masks.empty} masks are empty", f"{masks.full} cover everything"]
     about += "".join(f", {text}" for text, count in zip(left, (masks.without, masks.empty, masks.full)) if count)

@@ -21,6 +21,7 @@ from rtgs.mesh.settings import AUTOMATIC, HullSettings
 from rtgs.mesh.silhouettes import MaskSet, MaskView, SilhouetteScore, focus_point, silhouette_score
 from rtgs.mesh.smoothing import main_pieces, surface_of_field, taubin
 from rtgs.mesh.triangles import TriangleMesh
+from rtgs.native.threads import in_threads
 
 _FEWEST = 3  # masks
 _MOST_OUTVOTED = 4  # masks: more dilates the hull visibly
@@ -28,6 +29,7 @@ _VIEWS_PER_OUTVOTED = 8  # each costs sharpness: one for so many views
 _TRIAL_VOXELS = 48  # of the hulls among which the automatic k chooses
 _GENEROUS = 4  # the first rough hull lets one view in so many be wrong
 _TRIAL_STRIDE = 3  # pixels
+_PLANES, _POINTS = 64, 2048  # of a convex hull at a time: their products stay in the cache
 
 
 @dataclass(frozen=True)
@@ -239,7 +241,11 @@ def _convex_distance(points: np.ndarray, centres: np.ndarray, voxel: float) -> n
     from scipy.spatial import ConvexHull
 
     planes = np.unique(ConvexHull(centres).equations.round(6), axis=0)
-    outside = np.full(len(points), -np.inf)
-    for plane in planes:
-        np.maximum(outside, points @ plane[:3] + plane[3], out=outside)
-    return (0.5 * voxel - outside).astype(np.float32)
+    some = [planes[first : first + _PLANES] for first in range(0, len(planes), _PLANES)]
+
+    def outside(part: np.ndarray) -> np.ndarray:
+        places = np.concatenate([part.T, np.ones((1, len(part)))])
+        return np.max([(own @ places).max(0) for own in some], axis=0)
+
+    parts = np.array_split(points, max(1, -(-len(points) // _POINTS)))
+    return (0.5 * voxel - np.concatenate(in_threads(outside, parts))).astype(np.float32)

@@ -20,7 +20,7 @@ from torch import Tensor
 from rtgs.mesh.guide import MeshGuide
 from rtgs.mesh.silhouettes import MaskView
 from rtgs.mesh.triangles import TriangleMesh
-from rtgs.native.threads import serial_torch, threads
+from rtgs.native.threads import in_threads, serial_torch, threads
 
 HIDDEN = 1e9  # instead of a distance: the view says nothing about the point
 _CHUNK = 1 << 16  # points
@@ -81,24 +81,24 @@ def plain_outlines(views: Sequence[MaskView]) -> list[Outline]:
     """The masks as they are; gaps that a mask encloses count as object where no depth tells what they are."""
     from scipy.ndimage import binary_fill_holes
 
-    outlines = []
-    for view in views:
+    def outline(view: MaskView) -> Outline:
         mask = view.mask.numpy()
         whole = mask if view.depth is not None else np.asarray(binary_fill_holes(mask))
-        outlines.append(Outline(view, torch.from_numpy(whole & ~mask), None, signed_distance(whole), None))
-    return outlines
+        return Outline(view, torch.from_numpy(whole & ~mask), None, signed_distance(whole), None)
+
+    return in_threads(outline, views)
 
 
 def first_outlines(views: Sequence[MaskView]) -> list[Outline]:
     """Generous outlines to begin with, to be refined by depth: convex ones."""
     from skimage.morphology import convex_hull_image
 
-    outlines = []
-    for view in views:
+    def outline(view: MaskView) -> Outline:
         mask = view.mask.numpy()
         whole = np.asarray(convex_hull_image(mask))
-        outlines.append(Outline(view, torch.from_numpy(whole & ~mask), None, signed_distance(whole), None))
-    return outlines
+        return Outline(view, torch.from_numpy(whole & ~mask), None, signed_distance(whole), None)
+
+    return in_threads(outline, views)
 
 
 def refined_outlines(outlines: Sequence[Outline], hull: TriangleMesh) -> list[Outline]:
@@ -108,12 +108,11 @@ def refined_outlines(outlines: Sequence[Outline], hull: TriangleMesh) -> list[Ou
     ``outlines``: the first ones, whose hidden pixels are the gaps that the mask itself encloses.
     """
     guide = MeshGuide(hull, 0.0)
-    refined = []
-    for outline in outlines:
+
+    def refined(outline: Outline) -> Outline:
         view, depth = outline.view, outline.view.depth
         if depth is None:
-            refined.append(outline)
-            continue
+            return outline
         pixels = ~view.mask & (depth > 0)
         near, far = (torch.zeros(pixels.shape), torch.zeros(pixels.shape))
         near[pixels], far[pixels] = _sides(guide, view, pixels)
@@ -122,8 +121,9 @@ def refined_outlines(outlines: Sequence[Outline], hull: TriangleMesh) -> list[Ou
         mask = view.mask.numpy()
         bare = signed_distance(mask) if hidden.any() else None
         whole = signed_distance(mask | hidden.numpy())
-        refined.append(Outline(view, hidden, torch.where(opening, 0.0, depth), whole, bare))
-    return refined
+        return Outline(view, hidden, torch.where(opening, 0.0, depth), whole, bare)
+
+    return in_threads(refined, outlines)
 
 
 def _sides(guide: MeshGuide, view: MaskView, where: Tensor) -> tuple[Tensor, Tensor]:

@@ -64,15 +64,14 @@ def fit_pane(views: Sequence[MaskView]) -> Pane:
     some = [outlines[index] for index in chosen]
     center, half = focus_point(views), _half_size(views)
     toward = np.mean([_unit(view.camera.center.numpy() - center) for view in views], axis=0)
-    starts = []
-    for normal in _hemisphere(toward):
-        for offset in _OFFSETS:
-            plane = _plane(center + offset * half * normal, normal, half)
-            starts.append((_agreement(some, plane, _COARSE), plane))
-    starts.sort(key=lambda item: -item[0])
-    best, plane = starts[0]
+    planes = [
+        _plane(center + offset * half * normal, normal, half) for normal in _hemisphere(toward) for offset in _OFFSETS
+    ]
+    found = _agreements(some, planes, _COARSE)
+    starts = sorted(range(len(planes)), key=lambda k: -found[k])
+    best, plane = found[starts[0]], planes[starts[0]]
     if best > _HOPELESS:
-        best, plane = max((_improved(some, plane) for _, plane in starts[:_STARTS]), key=lambda item: item[0])
+        best, plane = max((_improved(some, planes[k]) for k in starts[:_STARTS]), key=lambda item: item[0])
     return Pane(*_mesh(outlines, plane), best)
 
 
@@ -178,12 +177,14 @@ def _votes(outlines: Sequence[Outline], points: np.ndarray) -> tuple[Tensor, Ten
     return inside / seen.clamp_min(1), seen
 
 
-def _agreement(outlines: Sequence[Outline], plane: _Plane, count: int) -> float:
-    """Intersection over union, on the plane, of every mask with what most of them show."""
-    share, seen = _votes(outlines, plane.points(count))
+def _agreements(outlines: Sequence[Outline], planes: Sequence[_Plane], count: int) -> list[float]:
+    """Intersection over union, on each plane, of every mask with what most of them show."""
+    points = np.stack([plane.points(count) for plane in planes])
+    share, seen = (votes.reshape(len(planes), -1) for votes in _votes(outlines, points))
     most = share > 0.5
-    union = (seen * torch.where(most, 1.0, share)).sum()
-    return float((seen * share)[most].sum() / union) if union > 0 else 0.0
+    union = (seen * torch.where(most, 1.0, share)).sum(1)
+    common = (seen * share * most).sum(1)
+    return torch.where(union > 0, common / union, 0.0).tolist()
 
 
 def _improved(outlines: Sequence[Outline], start: _Plane) -> tuple[float, _Plane]:
@@ -196,7 +197,7 @@ def _improved(outlines: Sequence[Outline], start: _Plane) -> tuple[float, _Plane
 
     simplex = np.concatenate([np.zeros((1, 3)), np.diag([0.15, 0.15, 0.08])])
     found = minimize(
-        lambda values: -_agreement(outlines, moved(values), _FINE),
+        lambda values: -_agreements(outlines, [moved(values)], _FINE)[0],
         np.zeros(3),
         method="Nelder-Mead",
         options={"initial_simplex": simplex, "maxfev": _STEPS, "xatol": 1e-4, "fatol": 1e-5},

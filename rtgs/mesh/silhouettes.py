@@ -15,6 +15,7 @@ from rtgs.core.errors import RtgsError
 from rtgs.mesh.guide import MeshGuide
 from rtgs.mesh.settings import COVERED
 from rtgs.mesh.triangles import TriangleMesh
+from rtgs.native.threads import in_threads
 
 _MOST_REACHES = 0.9  # quantile
 _LEAST_CROSSING = 1e-4  # of the smallest eigenvalue; two rays one degree apart
@@ -123,15 +124,15 @@ def silhouette_score(
         stride: every so manieth pixel in both directions only.
     """
     guide = MeshGuide(mesh, 0.0)
-    shares = []
-    for index, view in enumerate(views):
-        known = torch.ones_like(view.mask) if unknown is None else ~unknown[index]
-        mask, counted = (
-            picture[stride // 2 :: stride, stride // 2 :: stride].numpy() for picture in (view.mask, known)
-        )
-        seen = silhouette(guide, view.camera, stride)
+
+    def share(view: MaskView, hidden: Tensor | None) -> float:
+        some = (slice(stride // 2, None, stride),) * 2
+        mask, seen = view.mask[some].numpy(), silhouette(guide, view.camera, stride)
+        counted = np.ones_like(mask) if hidden is None else ~hidden[some].numpy()
         union = np.count_nonzero((seen | mask) & counted)
-        shares.append(np.count_nonzero(seen & mask & counted) / union if union else 1.0)
+        return np.count_nonzero(seen & mask & counted) / union if union else 1.0
+
+    shares = in_threads(share, views, [None] * len(views) if unknown is None else unknown)
     lowest = int(np.argmin(shares))
     return SilhouetteScore(float(np.mean(shares)), shares[lowest], views[lowest].camera.name, tuple(shares))
 

@@ -7,11 +7,15 @@ on two threads they take longer than on one (docs/lab/benchmarks.md).
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
+from typing import TypeVar
 
 import torch
+
+Result = TypeVar("Result")
 
 SERIAL_PIXELS = 1 << 18  # of a picture, up to which waking threads costs torch's operations more than it brings
 
@@ -36,6 +40,13 @@ def serial_torch(wanted: bool = True) -> Iterator[None]:
             yield
     finally:
         _kernels.reset(before)
+
+
+def in_threads(work: Callable[..., Result], *items: Iterable) -> list[Result]:
+    """``work`` of the items, in their order, in as many of Python's threads as the kernels have: for calls that let go
+    of the interpreter (numpy, scipy, Embree; torch in :func:`serial_torch`)."""
+    with ThreadPoolExecutor(threads()) as workers:
+        return list(workers.map(work, *items))
 
 
 @contextmanager
