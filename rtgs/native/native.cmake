@@ -11,6 +11,7 @@ set(RTGS_KERNELS
   gaussians/mirror_light.cpp
   image/srgb.cpp
   image/blend.cpp
+  image/wall.cpp
   light/lookup.cpp
   light/filter.cpp
   light/features.cpp
@@ -45,6 +46,7 @@ set(RTGS_BINDINGS
   bind/blend.cpp
   image/traced_pixels.cpp
   bind/traced_pixels.cpp
+  bind/wall.cpp
   light/border.cpp
   bind/light.cpp
   bind/features.cpp

@@ -6,13 +6,18 @@ nothing (Mitsuba's ``thindielectric``; Stam 2001 for the series). Of tinted glas
 for each colour. What it leaves out: that glass absorbs more the longer the way through the wall is, and takes from R
 as well; the shift of the ray inside the wall; polarisation from one wall to the next.
 
-Plain torch, any dtype and shape, differentiable in both arguments.
+Any dtype and shape, differentiable in both arguments. What a wall reflects goes through a native kernel in float32; all
+else is plain torch.
 """
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from rtgs.native import core
+from rtgs.native.threads import threads
 
 SMALLEST_COSINE = 1e-4  # at grazing incidence all light is reflected; the slope in the cosine stays finite
 
@@ -51,6 +56,13 @@ def wall_reflectance(cosine: Tensor, index: Tensor | float) -> Tensor:
     cosine, index : Tensor, Tensor or float
         As of :func:`fresnel_dielectric`.
     """
+    if not is_native(cosine, index):
+        return wall_reflectance_twin(cosine, index)
+    return _Wall.apply(cosine, index)  # type: ignore[return-value]
+
+
+def wall_reflectance_twin(cosine: Tensor, index: Tensor | float) -> Tensor:
+    """:func:`wall_reflectance` in plain torch."""
     surface = fresnel_dielectric(cosine, index)
     return 2 * surface / (1 + surface)
 
@@ -73,3 +85,37 @@ def passed(reflected: Tensor, wall: Tensor | float = 1.0, tint: Tensor | None = 
         1 - R, or (..., 3): (1 - wall) + (wall - R) tint, so R + T is never above 1.
     """
     return 1 - reflected if tint is None else (1 - wall) + (wall - reflected) * tint
+
+
+def is_native(cosine: Tensor, index: Tensor | float) -> bool:
+    """Kernels take them: float32 on the CPU, one index for all cosines."""
+    given = [cosine, index] if isinstance(index, Tensor) else [cosine]
+    if any(each.dtype != torch.float32 or each.device.type != "cpu" for each in given):
+        return False
+    return not isinstance(index, Tensor) or (index.numel() == 1 and index.ndim <= cosine.ndim)
+
+
+def number(index: Tensor | float) -> float:
+    """The index alone, without its graph."""
+    return float(index.detach()) if isinstance(index, Tensor) else index
+
+
+class _Wall(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, cosine: Tensor, index: Tensor | float) -> Tensor:
+        cosine = cosine.detach().contiguous()
+        reflected = torch.empty_like(cosine)
+        ctx.index = number(index)
+        core.wall_reflectance(cosine.numpy(), ctx.index, reflected.numpy(), threads())
+        ctx.save_for_backward(cosine)
+        ctx.shape = index.shape if isinstance(index, Tensor) else None
+        return reflected
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, upstream: Tensor):  # type: ignore[override]
+        (cosine,) = ctx.saved_tensors
+        to_cosine, to_index = torch.empty_like(cosine), torch.empty(ctx.shape or ())
+        arrays = [each.numpy() for each in (upstream.contiguous(), to_cosine, to_index)]
+        core.wall_reflectance_backward(cosine.numpy(), ctx.index, *arrays, threads())
+        return to_cosine, None if ctx.shape is None else to_index

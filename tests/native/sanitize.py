@@ -24,6 +24,7 @@ TESTS = (
     "tests/methods/test_mirror_native.py",
     "tests/methods/test_thread_bits.py",
     "tests/optics/test_light.py",
+    "tests/optics/test_walls_native.py",
     "tests/light/test_cube_lookup.py",
     "tests/light/test_feature_network.py",
 )
