@@ -56,7 +56,7 @@ def wall_reflectance(cosine: Tensor, index: Tensor | float) -> Tensor:
     cosine, index : Tensor, Tensor or float
         As of :func:`fresnel_dielectric`.
     """
-    if not is_native(cosine, index):
+    if not all_native(index, cosine) or (isinstance(index, Tensor) and index.ndim > cosine.ndim):
         return wall_reflectance_twin(cosine, index)
     return _Wall.apply(cosine, index)  # type: ignore[return-value]
 
@@ -87,12 +87,12 @@ def passed(reflected: Tensor, wall: Tensor | float = 1.0, tint: Tensor | None = 
     return 1 - reflected if tint is None else (1 - wall) + (wall - reflected) * tint
 
 
-def is_native(cosine: Tensor, index: Tensor | float) -> bool:
-    """Kernels take them: float32 on the CPU, one index for all cosines."""
-    given = [cosine, index] if isinstance(index, Tensor) else [cosine]
+def all_native(index: Tensor | float, *maps: Tensor | None) -> bool:
+    """Kernels take them: float32 on the CPU, where there are any, and one index for all of them."""
+    given = [each for each in (index, *maps) if isinstance(each, Tensor)]
     if any(each.dtype != torch.float32 or each.device.type != "cpu" for each in given):
         return False
-    return not isinstance(index, Tensor) or (index.numel() == 1 and index.ndim <= cosine.ndim)
+    return not isinstance(index, Tensor) or index.numel() == 1
 
 
 def number(index: Tensor | float) -> float:

@@ -22,6 +22,7 @@ TESTS = (
     "tests/gaussians/test_adam.py",
     "tests/train/test_losses.py",
     "tests/methods/test_mirror_native.py",
+    "tests/methods/test_inner_native.py",
     "tests/methods/test_thread_bits.py",
     "tests/optics/test_light.py",
     "tests/optics/test_walls_native.py",

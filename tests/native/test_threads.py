@@ -107,6 +107,9 @@ CALLS = {
     ),
     "decode": lambda threads: core.srgb_decode(_floats(4), _floats(4), threads),
     "wall": lambda threads: core.wall_reflectance(_floats(4), 1.5, _floats(4), threads),
+    "wall leg": lambda threads: core.wall_leg(
+        (_floats(4, 3), _floats(4), _floats(4, 3), None, _floats(4)), _floats(4), (1.5, None), _floats(4, 3), threads
+    ),
     "encode": lambda threads: core.srgb_encode(_floats(4), _floats(4), threads),
     "cube lookup": lambda threads: core.cube_lookup(
         _floats(6 * 16, 4), np.array([2], np.int32), _floats(4, 3), _floats(0), _floats(4, 3), threads

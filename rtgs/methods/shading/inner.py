@@ -14,9 +14,12 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
-from rtgs.mesh.inner_paths import InnerPaths
-from rtgs.optics.dielectric import passed, wall_reflectance
+from rtgs.mesh.inner_paths import InnerPaths, Leg
+from rtgs.native import core
+from rtgs.native.threads import threads
+from rtgs.optics.dielectric import all_native, number, passed, wall_reflectance
 from rtgs.optics.light import decoded, encoded
 
 LINEAR = "linear"
@@ -40,15 +43,36 @@ def inner_light(
     """
     arriving: Tensor | None = None
     for k in reversed(range(len(traced))):
-        leg, met = paths.legs[k], traced[k]
-        reflected = (leg.wall * wall_reflectance(leg.cosine.to(met.alpha.dtype), index))[:, None]
-        light = passed(reflected, leg.wall[:, None], tint) * decoded(met.surroundings, LINEAR)
+        later = None
         if arriving is not None:
-            later = torch.zeros_like(light).index_copy(0, paths.legs[k + 1].parent, arriving)
-            light = light + reflected * later
-        arriving = decoded(met.contents + (1 - met.alpha)[:, None] * encoded(light, LINEAR), LINEAR)
+            later = torch.zeros_like(traced[k].contents).index_copy(0, paths.legs[k + 1].parent, arriving)
+        arriving = leg_light(paths.legs[k], traced[k], later, index, tint)
     assert arriving is not None
     return arriving
+
+
+def leg_light(
+    leg: Leg, met: TracedLeg, later: Tensor | None, index: Tensor | float, tint: Tensor | None = None
+) -> Tensor:
+    """(L, 3) linear light that comes along one leg. float32 goes through a native kernel.
+
+    ``later`` (L, 3): linear light that comes to the wall at its end from inside; None: none.
+    """
+    given = (met.contents, met.alpha, met.surroundings, later, leg.cosine)
+    if leg.wall.requires_grad or not all_native(index, *given, leg.wall, tint):
+        return leg_light_twin(leg, met, later, index, tint)
+    return _LegLight.apply(*given, leg.wall, index, tint)  # type: ignore[return-value]
+
+
+def leg_light_twin(
+    leg: Leg, met: TracedLeg, later: Tensor | None, index: Tensor | float, tint: Tensor | None = None
+) -> Tensor:
+    """:func:`leg_light` in plain torch."""
+    reflected = (leg.wall * wall_reflectance(leg.cosine.to(met.alpha.dtype), index))[:, None]
+    light = passed(reflected, leg.wall[:, None], tint) * decoded(met.surroundings, LINEAR)
+    if later is not None:
+        light = light + reflected * later
+    return decoded(met.contents + (1 - met.alpha)[:, None] * encoded(light, LINEAR), LINEAR)
 
 
 def far_wall(
@@ -73,3 +97,29 @@ def far_wall(
     through = passed(reflected, 1.0, tint)
     passing = torch.ones(len(behind), through.shape[1], dtype=behind.dtype).index_copy(0, rows, through)
     return (passing * behind).index_add(0, rows, reflected * arriving)
+
+
+def arrays_of(*tensors: Tensor | None) -> tuple:
+    """What a kernel takes of them."""
+    return tuple(None if each is None else each.detach().contiguous().numpy() for each in tensors)
+
+
+class _LegLight(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, *given) -> Tensor:
+        *maps, wall, index, tint = given
+        arriving = torch.empty(*maps[0].shape)
+        ctx.glass, ctx.index_shape = (number(index), *arrays_of(tint)), getattr(index, "shape", None)
+        core.wall_leg(arrays_of(*maps), *arrays_of(wall), ctx.glass, arriving.numpy(), threads())
+        ctx.save_for_backward(*maps, wall, tint)
+        return arriving
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, upstream: Tensor):  # type: ignore[override]
+        *maps, wall, tint = ctx.saved_tensors
+        gradients, to_glass = [None if each is None else torch.empty(each.shape) for each in maps], torch.empty(4)
+        given = (arrays_of(*maps), *arrays_of(wall), ctx.glass, *arrays_of(upstream))
+        core.wall_leg_backward(*given, arrays_of(*gradients), to_glass.numpy(), threads())
+        to_index = None if ctx.index_shape is None else to_glass[:1].reshape(ctx.index_shape)
+        return (*gradients, None, to_index, None if tint is None else to_glass[1:])

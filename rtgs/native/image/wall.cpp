@@ -3,6 +3,7 @@
 #include "common/parallel.h"
 #include "image/wall.h"
 
+#include "image/srgb_curve.h"
 #include "image/vectors.h"
 
 namespace rtgs::RTGS_ISA {
@@ -74,6 +75,67 @@ void wall_reflectance_backward(const WallAngles& in, const float* upstream, floa
     const vfloat given = load_first(upstream + first, lanes);
     store_first(cosine + first, given * s.by_cosine(), lanes);
     totals[0] += given * s.by_index();
+  });
+}
+
+namespace {
+
+struct Leg {  // of kLanes rays: I = dec(C + (1 - A) enc(light)), light = T dec(E) + R I'
+  Surface surface;
+  vfloat wall, reflected, left;
+  Vector surroundings, own, passing, later, light, shown, mixed;  // own: decoded; shown: encoded light
+
+  Leg(const WallLeg& in, int64_t first, int lanes)
+      : surface(load_first(in.cosine + first, lanes), in.glass.index), wall(load_first(in.wall + first, lanes)),
+        reflected(wall * surface.reflected()), left(1.f - load_first(in.alpha + first, lanes)),
+        surroundings(load_vectors(in.surroundings, first, lanes)), later{} {
+    if (in.later) later = load_vectors(in.later, first, lanes);
+    const Vector contents = load_vectors(in.contents, first, lanes);
+    for (int k = 0; k < 3; ++k) {
+      own.v[k] = decoded(surroundings.v[k]);
+      passing.v[k] = in.glass.tinted ? (1.f - wall) + (wall - reflected) * in.glass.tint[k] : 1.f - reflected;
+      light.v[k] = fma(passing.v[k], own.v[k], reflected * later.v[k]);
+      shown.v[k] = encoded(light.v[k]);
+      mixed.v[k] = fma(left, shown.v[k], contents.v[k]);
+    }
+  }
+};
+
+}  // namespace
+
+void wall_leg(const WallLeg& in, float* arriving) {
+  each_block(worth(in.threads, 3 * in.count), in.count, kLanes, [&](int64_t first) {
+    const int lanes = lanes_at(first, in.count);
+    Vector out = Leg(in, first, lanes).mixed;
+    for (int k = 0; k < 3; ++k) out.v[k] = decoded(out.v[k]);
+    store_vectors(arriving, first, lanes, out);
+  });
+}
+
+void wall_leg_backward(const WallLeg& in, const float* upstream, const WallLegGradients& out) {
+  const int threads = worth(in.threads, 3 * in.count);
+  for_blocks<kGlassNumbers>(threads, in.count, out.glass, [&](int64_t first, int lanes, vfloat* totals) {
+    const Leg leg(in, first, lanes);
+    const Vector given = load_vectors(upstream, first, lanes);
+    Vector to_contents, to_surroundings, to_later;
+    vfloat to_left{}, to_reflected{};
+    for (int k = 0; k < 3; ++k) {
+      const float tint = in.glass.tinted ? in.glass.tint[k] : 1.f;
+      to_contents.v[k] = given.v[k] * decode_slope(leg.mixed.v[k]);
+      to_left += to_contents.v[k] * leg.shown.v[k];
+      const vfloat to_light = to_contents.v[k] * leg.left * encode_slope(leg.light.v[k]);
+      to_surroundings.v[k] = to_light * leg.passing.v[k] * decode_slope(leg.surroundings.v[k]);
+      to_later.v[k] = to_light * leg.reflected;
+      to_reflected += to_light * (leg.later.v[k] - tint * leg.own.v[k]);
+      totals[1 + k] += to_light * leg.own.v[k] * (leg.wall - leg.reflected);
+    }
+    store_vectors(out.contents, first, lanes, to_contents);
+    store_first(out.alpha + first, -to_left, lanes);
+    store_vectors(out.surroundings, first, lanes, to_surroundings);
+    if (out.later) store_vectors(out.later, first, lanes, to_later);
+    to_reflected *= leg.wall;
+    store_first(out.cosine + first, to_reflected * leg.surface.by_cosine(), lanes);
+    totals[0] += to_reflected * leg.surface.by_index();
   });
 }
 

@@ -1,4 +1,5 @@
-// Thin walls of glass: what they reflect. Twin: rtgs/optics/dielectric.py.
+// Thin walls of glass: what they reflect, and the light that comes to one of them along a path inside the object.
+// Twins: rtgs/optics/dielectric.py, rtgs/methods/shading/inner.py.
 #pragma once
 #include <cstdint>
 
@@ -14,10 +15,31 @@ struct WallAngles {
   int threads;
 };
 
+struct Glass {
+  float index;
+  bool tinted;
+  float tint[3];  // of light that passes
+};
+constexpr int kGlassNumbers = 4;  // in sums: by the index, by the tint
+
+struct WallLeg {  // L rays inside the object, each to a wall
+  int64_t count;
+  const float *contents, *alpha, *surroundings;  // (L, 3), (L), (L, 3): encoded
+  const float* later;                            // (L, 3) linear light mirrored at that wall; null: none
+  const float *cosine, *wall;                    // (L) there, (L) 1: there is one, 0: none
+  Glass glass;
+  int threads;
+};
+struct WallLegGradients {  // later: null without it; glass: (blocks, kGlassNumbers) partial sums
+  float *contents, *alpha, *surroundings, *later, *cosine, *glass;
+};
+
 #define RTGS_DECLARE_WALL_KERNELS(isa)                                                                    \
   namespace isa {                                                                                         \
   void wall_reflectance(const WallAngles&, float* reflected);                                             \
   void wall_reflectance_backward(const WallAngles&, const float* upstream, float* cosine, float* index);  \
+  void wall_leg(const WallLeg&, float* arriving);                                                         \
+  void wall_leg_backward(const WallLeg&, const float* upstream, const WallLegGradients&);                 \
   }  // index: (blocks) partial sums
 RTGS_DECLARE_WALL_KERNELS(portable)
 #if defined(__x86_64__)
