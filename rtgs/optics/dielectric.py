@@ -95,9 +95,10 @@ def all_native(index: Tensor | float, *maps: Tensor | None) -> bool:
     return not isinstance(index, Tensor) or index.numel() == 1
 
 
-def number(index: Tensor | float) -> float:
-    """The index alone, without its graph."""
-    return float(index.detach()) if isinstance(index, Tensor) else index
+def glass_numbers(index: Tensor | float, tint: Tensor | None = None) -> tuple[float, list[float] | None]:
+    """What kernels take of the index and the tint."""
+    number = float(index.detach()) if isinstance(index, Tensor) else index
+    return number, None if tint is None else tint.detach().tolist()
 
 
 class _Wall(torch.autograd.Function):
@@ -105,7 +106,7 @@ class _Wall(torch.autograd.Function):
     def forward(ctx, cosine: Tensor, index: Tensor | float) -> Tensor:
         cosine = cosine.detach().contiguous()
         reflected = torch.empty_like(cosine)
-        ctx.index = number(index)
+        ctx.index, _ = glass_numbers(index)
         core.wall_reflectance(cosine.numpy(), ctx.index, reflected.numpy(), threads())
         ctx.save_for_backward(cosine)
         ctx.shape = index.shape if isinstance(index, Tensor) else None

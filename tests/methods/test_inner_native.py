@@ -128,21 +128,22 @@ def test_an_index_may_be_a_number_and_what_kernels_do_not_take_is_the_plain_one(
 
 
 def test_arrays_that_do_not_fit_are_refused():
-    rows, one, tint = torch.zeros(4, 3).numpy(), torch.zeros(4).numpy(), torch.zeros(3).numpy()
+    rows, one, three = torch.zeros(4, 3).numpy(), torch.zeros(4).numpy(), torch.zeros(3).numpy()
+    tint = (0.5, 0.5, 1.0)
     leg = (rows, one, rows, None, one)
     core.wall_leg(leg, one, (1.5, tint), rows, 1)
     with pytest.raises(ValueError, match="wall: alpha holds 12 numbers, expected 4"):
         core.wall_leg((rows, rows, rows, None, one), one, (1.5, tint), rows, 1)
     with pytest.raises(ValueError, match="wall: later light holds 4 numbers, expected 12"):
         core.wall_leg((rows, one, rows, one, one), one, (1.5, tint), rows, 1)
-    with pytest.raises(ValueError, match="wall: tint holds 4 numbers, expected 3"):
-        core.wall_leg(leg, one, (1.5, one), rows, 1)
+    with pytest.raises(TypeError):
+        core.wall_leg(leg, one, (1.5, (*tint, 1.0)), rows, 1)
     with pytest.raises(ValueError, match="wall: arriving light holds 4 numbers, expected 12"):
         core.wall_leg(leg, one, (1.5, None), one, 1)
     with pytest.raises(ValueError, match="later light and its gradient go together"):
         core.wall_leg_backward(leg, one, (1.5, None), rows, (rows, one, rows, rows, one), one, 1)
     with pytest.raises(ValueError, match="wall: gradient of index and tint holds 3 numbers, expected 4"):
-        core.wall_leg_backward(leg, one, (1.5, None), rows, leg, tint, 1)
+        core.wall_leg_backward(leg, one, (1.5, None), rows, leg, three, 1)
     with pytest.raises(TypeError):
         core.wall_leg((rows.astype("float64"), one, rows, None, one), one, (1.5, None), rows, 1)
     with pytest.raises(TypeError):

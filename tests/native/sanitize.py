@@ -23,6 +23,7 @@ TESTS = (
     "tests/train/test_losses.py",
     "tests/methods/test_mirror_native.py",
     "tests/methods/test_inner_native.py",
+    "tests/methods/test_far_wall_native.py",
     "tests/methods/test_thread_bits.py",
     "tests/optics/test_light.py",
     "tests/optics/test_walls_native.py",

@@ -74,6 +74,11 @@ def _features(threads: int) -> None:
     )
 
 
+def _far_wall(threads: int) -> None:
+    given, rows = (None, _floats(2, 3), _floats(0, 3), _floats(0)), (np.arange(2), np.zeros(0, np.int64))
+    core.far_wall(_floats(3, 4), given, rows, (1.5, None), _floats(3, 4), threads)
+
+
 CALLS = {
     "rasterise surfels": _raster,
     "rasterise ellipsoids": _ellipsoids,
@@ -110,6 +115,7 @@ CALLS = {
     "wall leg": lambda threads: core.wall_leg(
         (_floats(4, 3), _floats(4), _floats(4, 3), None, _floats(4)), _floats(4), (1.5, None), _floats(4, 3), threads
     ),
+    "far wall": _far_wall,
     "encode": lambda threads: core.srgb_encode(_floats(4), _floats(4), threads),
     "cube lookup": lambda threads: core.cube_lookup(
         _floats(6 * 16, 4), np.array([2], np.int32), _floats(4, 3), _floats(0), _floats(4, 3), threads

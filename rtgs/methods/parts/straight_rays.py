@@ -15,9 +15,10 @@ from rtgs.methods.parts.part import Frame
 from rtgs.methods.parts.traced_set import FollowingTree, TracedSet, trace_set
 from rtgs.methods.parts.wall_light import InnerRays
 from rtgs.methods.settings import MethodSettings
-from rtgs.methods.shading.inner import LINEAR, TracedLeg, far_wall, inner_light
+from rtgs.methods.shading.far_wall import Behind, seen_through
+from rtgs.methods.shading.inner import LINEAR, TracedLeg, inner_light
 from rtgs.methods.shading.straight import FirstBounce, GlassRays, Transmission
-from rtgs.optics.light import decoded, encoded
+from rtgs.optics.light import decoded
 from rtgs.render.buffers import TraceBuffers, TraceOptions
 from rtgs.train.method import Observation, RenderOptions
 
@@ -33,19 +34,16 @@ class FarWall:
 
 
 @torch.no_grad()
-def _parts(contents: Tensor, color: Tensor, passing: Tensor, sent: Tensor, wall: FarWall) -> dict[str, Tensor]:
+def _parts(contents: Tensor, color: Tensor, behind: Behind) -> dict[str, Tensor]:
     """(R, 3) linear light each, whose sum is that of ``color``: of the contents, and the rest by what the wall sends.
 
     Contents are composited in the photos' encoding, so only shares of the rest are known: those of the light sent.
     """
-    own = decoded(contents, LINEAR)
+    own, passing = decoded(contents, LINEAR), behind.passing(len(contents))
     rest = (decoded(color, LINEAR) - own).clamp_min(0)
-    through = passing
-    if wall.inner is not None:
-        none = torch.zeros(len(wall.inner.rows), 3)
-        through = far_wall(passing, none, wall.inner.rows, wall.inner.paths.cosine, wall.index, wall.tint)
-    behind = rest * (through / sent.clamp_min(1e-9)).clamp(0, 1)
-    return {"contents": own, "behind": behind, "inner": rest - behind}
+    through = replace(behind, arriving=torch.zeros_like(behind.arriving)).sent(passing)
+    seen = rest * (through / behind.sent(passing).clamp_min(1e-9)).clamp(0, 1)
+    return {"contents": own, "behind": seen, "inner": rest - seen}
 
 
 def _of_pixels(rays: GlassRays, values: Tensor) -> Tensor:
@@ -92,14 +90,13 @@ class StraightRays:
         color, parts = first.colors, {}
         if self._goes_on:
             rows, behind = self._behind(rays if onward is None else onward, first, degree)
-            shown = (1 - first.alpha)[:, None] if self.settings.transmittance.compositing == "over" else None
+            over = self.settings.transmittance.compositing == "over"
             if wall is None:
-                color = color.index_add(0, rows, behind if shown is None else shown[rows] * behind)
+                color = color.index_add(0, rows, (1 - first.alpha)[rows, None] * behind if over else behind)
             else:
-                passing = decoded(torch.zeros_like(color).index_add(0, rows, behind), LINEAR)
-                sent = self._sent(passing, wall)
-                color = color + (1.0 if shown is None else shown) * encoded(sent, LINEAR)
-                parts = _parts(first.colors, color, passing, sent, wall) if frame.options.layers else {}
+                met = self._met(rows, behind, wall)
+                color = seen_through(first.colors, first.alpha if over else None, met)
+                parts = _parts(first.colors, color, met) if frame.options.layers else {}
         full, *lights = (_of_pixels(rays, each) for each in (color, *parts.values()))
         depths = self._depths(rays, first) if self.measured else None
         return Transmission(full, depths, observations, dict(zip(parts, lights, strict=True)))
@@ -110,12 +107,13 @@ class StraightRays:
         bounce = self.settings.transmittance.second_bounce
         return bounce == "first_bounce" or (bounce == "mesh" and not self.mesh.flat)
 
-    def _sent(self, passing: Tensor, wall: FarWall) -> Tensor:
-        """(R, 3) linear light that the far wall sends on: ``passing`` light, less what it reflects, and mirrored."""
+    def _met(self, rows: Tensor, color: Tensor, wall: FarWall) -> Behind:
+        """What lies behind the contents: the ``color`` (B, 3) that ``rows`` meet, and the light from inside."""
         if wall.inner is None:
-            return passing
+            none = torch.zeros(0, dtype=torch.long), torch.zeros(0, 3), torch.zeros(0)
+            return Behind(rows, color, *none, wall.index, wall.tint)
         arriving = inner_light(wall.inner.paths, self._legs(wall), wall.index, wall.tint)
-        return far_wall(passing, arriving, wall.inner.rows, wall.inner.paths.cosine, wall.index, wall.tint)
+        return Behind(rows, color, wall.inner.rows, arriving, wall.inner.paths.cosine, wall.index, wall.tint)
 
     def _legs(self, wall: FarWall) -> list[TracedLeg]:
         """What was traced along the legs inside the object: its contents, and what the leaving rays met."""

@@ -19,7 +19,7 @@ from torch.autograd.function import once_differentiable
 from rtgs.mesh.inner_paths import InnerPaths, Leg
 from rtgs.native import core
 from rtgs.native.threads import threads
-from rtgs.optics.dielectric import all_native, number, passed, wall_reflectance
+from rtgs.optics.dielectric import all_native, glass_numbers, passed, wall_reflectance
 from rtgs.optics.light import decoded, encoded
 
 LINEAR = "linear"
@@ -109,17 +109,17 @@ class _LegLight(torch.autograd.Function):
     def forward(ctx, *given) -> Tensor:
         *maps, wall, index, tint = given
         arriving = torch.empty(*maps[0].shape)
-        ctx.glass, ctx.index_shape = (number(index), *arrays_of(tint)), getattr(index, "shape", None)
+        ctx.glass, ctx.index_shape = glass_numbers(index, tint), getattr(index, "shape", None)
         core.wall_leg(arrays_of(*maps), *arrays_of(wall), ctx.glass, arriving.numpy(), threads())
-        ctx.save_for_backward(*maps, wall, tint)
+        ctx.save_for_backward(*maps, wall)
         return arriving
 
     @staticmethod
     @once_differentiable
     def backward(ctx, upstream: Tensor):  # type: ignore[override]
-        *maps, wall, tint = ctx.saved_tensors
+        *maps, wall = ctx.saved_tensors
         gradients, to_glass = [None if each is None else torch.empty(each.shape) for each in maps], torch.empty(4)
         given = (arrays_of(*maps), *arrays_of(wall), ctx.glass, *arrays_of(upstream))
         core.wall_leg_backward(*given, arrays_of(*gradients), to_glass.numpy(), threads())
         to_index = None if ctx.index_shape is None else to_glass[:1].reshape(ctx.index_shape)
-        return (*gradients, None, to_index, None if tint is None else to_glass[1:])
+        return (*gradients, None, to_index, None if ctx.glass[1] is None else to_glass[1:])

@@ -1,6 +1,7 @@
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 
+#include <algorithm>
 #include <optional>
 #include <tuple>
 #include <vector>
@@ -30,7 +31,8 @@ struct Blocks {
 };
 
 using Maybe = std::optional<Floats>;
-using GlassNumbers = std::tuple<float, Maybe>;                        // index, tint
+using Tint = std::tuple<float, float, float>;
+using GlassNumbers = std::tuple<float, std::optional<Tint>>;          // index, tint
 using LegArrays = std::tuple<Floats, Floats, Floats, Maybe, Floats>;  // contents, alpha, surroundings, later, cosine
 
 float* pointer(const Maybe& array) { return array ? array->data() : nullptr; }
@@ -38,9 +40,8 @@ float* pointer(const Maybe& array) { return array ? array->data() : nullptr; }
 Glass glass_of(const GlassNumbers& numbers) {
   const auto& [index, tint] = numbers;
   if (!tint) return {index, false, {1, 1, 1}};
-  require(kWall, *tint, "tint", 3);
-  const float* t = tint->data();
-  return {index, true, {t[0], t[1], t[2]}};
+  const auto [red, green, blue] = *tint;
+  return {index, true, {red, green, blue}};
 }
 
 WallLegGradients checked_leg(const LegArrays& arrays, int64_t count) {
@@ -59,6 +60,52 @@ WallLeg leg_of(const LegArrays& arrays, const Floats& wall, const GlassNumbers& 
   return {count, a.contents, a.alpha, a.surroundings, a.later, a.cosine, wall.data(), glass_of(glass),
           checked_threads(threads)};
 }
+
+using Rows = nb::ndarray<const int64_t, nb::c_contig, nb::device::cpu>;
+using TwoRows = std::tuple<Rows, Rows>;                          // of behind, of arriving
+using BehindArrays = std::tuple<Maybe, Floats, Floats, Floats>;  // alpha, behind, arriving, cosine
+
+// Where each ray's row is in a list of rays, in whole registers of any length; -1: it is not in it.
+std::vector<int32_t> places_of(const Rows& rows, int64_t count) {
+  std::vector<int32_t> place(size_t((count + 15) / 16 * 16), -1);
+  for (size_t k = 0; k < rows.size(); ++k) {
+    const int64_t row = rows.data()[k];
+    if (row < 0 || row >= count || place[size_t(row)] >= 0)
+      throw std::invalid_argument("wall: row " + std::to_string(row) + " of " + std::to_string(count) +
+                                  " rays; each can be named once");
+    place[size_t(row)] = int32_t(k);
+  }
+  return place;
+}
+
+FarWallGradients checked_behind(const BehindArrays& arrays, const TwoRows& rows, int64_t count) {
+  const auto& [alpha, behind, arriving, cosine] = arrays;
+  const int64_t shown = int64_t(std::get<0>(rows).size()), mirrored = int64_t(std::get<1>(rows).size());
+  if (alpha) require(kWall, *alpha, "alpha", count);
+  require(kWall, behind, "behind", 3 * shown);
+  require(kWall, arriving, "arriving light", 3 * mirrored);
+  require(kWall, cosine, "cosine", mirrored);
+  static float nothing[3] = {};  // is read where there are no rows, and never written
+  return {pointer(alpha), shown ? behind.data() : nothing, mirrored ? arriving.data() : nothing,
+          mirrored ? cosine.data() : nothing, nullptr};
+}
+
+struct FarWallRays {
+  FarWallRays(const Floats& contents, const BehindArrays& arrays, const TwoRows& rows, const GlassNumbers& glass,
+              int threads)
+      : count(int64_t(contents.size() / 3)) {
+    require(kWall, contents, "contents", 3 * count);
+    if (count > (1 << 29)) throw std::invalid_argument("wall: " + std::to_string(count) + " rays; 2^29 are possible");
+    const FarWallGradients a = checked_behind(arrays, rows, count);
+    behind = places_of(std::get<0>(rows), count);
+    mirrored = places_of(std::get<1>(rows), count);
+    in = {count, contents.data(), a.alpha, a.behind, a.arriving, a.cosine, behind.data(), mirrored.data(),
+          glass_of(glass), checked_threads(threads)};
+  }
+  int64_t count;
+  std::vector<int32_t> behind, mirrored;
+  FarWall in;
+};
 
 }  // namespace
 
@@ -110,6 +157,33 @@ void bind_wall(nb::module_& m) {
   }, nb::arg("given"), nb::arg("wall"), nb::arg("glass"), nb::arg("upstream"), nb::arg("gradients"),
      nb::arg("to_glass"), nb::arg("threads"),
      "Fills the gradients by what was given, and (4,) by index and tint, which all rays share.");
+  m.def("far_wall", [](Floats contents, BehindArrays given, TwoRows rows, GlassNumbers glass, Floats color,
+                       int threads) {
+    const FarWallRays rays(contents, given, rows, glass, threads);
+    require(kWall, color, "color", 3 * rays.count);
+    float* out = color.data();
+    nb::gil_scoped_release release;
+    RTGS_DISPATCH(far_wall, rays.in, out);
+  }, nb::arg("contents"), nb::arg("given"), nb::arg("rows").noconvert(), nb::arg("glass"), nb::arg("color"),
+     nb::arg("threads"), "Fills the colors (3, R) of contents (3, R) and what the far wall sends; given: alpha or None, behind, arriving "
+     "light, cosine; rows: rays of behind, of arriving light; see rtgs/methods/shading/far_wall.py.");
+  m.def("far_wall_backward", [](Floats contents, BehindArrays given, TwoRows rows, GlassNumbers glass, Floats upstream,
+                                BehindArrays gradients, Floats to_glass, int threads) {
+    const FarWallRays rays(contents, given, rows, glass, threads);
+    require(kWall, upstream, "upstream", 3 * rays.count);
+    require(kWall, to_glass, "gradient of index and tint", kGlassNumbers);
+    Blocks blocks(rays.count, kGlassNumbers);
+    FarWallGradients out = checked_behind(gradients, rows, rays.count);
+    if (!rays.in.alpha != !out.alpha) throw std::invalid_argument("wall: alpha and its gradient go together");
+    out.glass = blocks.parts.data();
+    const float* from = upstream.data();
+    float* total = to_glass.data();
+    nb::gil_scoped_release release;
+    RTGS_DISPATCH(far_wall_backward, rays.in, from, out);
+    blocks.total(total);
+  }, nb::arg("contents"), nb::arg("given"), nb::arg("rows").noconvert(), nb::arg("glass"), nb::arg("upstream"),
+     nb::arg("gradients"), nb::arg("to_glass"), nb::arg("threads"),
+     "Fills the gradients by what was given, and (4,) by index and tint; that by contents is upstream itself.");
 }
 
 }  // namespace rtgs

@@ -1,5 +1,5 @@
-// Thin walls of glass: what they reflect, and the light that comes to one of them along a path inside the object.
-// Twins: rtgs/optics/dielectric.py, rtgs/methods/shading/inner.py.
+// Thin walls of glass: what they reflect, the light that comes to one of them along a path inside the object, and what
+// is seen through the far one. Twins: rtgs/optics/dielectric.py, rtgs/methods/shading/inner.py, far_wall.py beside it.
 #pragma once
 #include <cstdint>
 
@@ -34,13 +34,28 @@ struct WallLegGradients {  // later: null without it; glass: (blocks, kGlassNumb
   float *contents, *alpha, *surroundings, *later, *cosine, *glass;
 };
 
+struct FarWall {  // R rays through an object
+  int64_t count;
+  const float *contents, *alpha;               // (3, R) encoded, (R); no alpha: the rest is added to the contents
+  const float* behind;                         // (B, 3) encoded; one row that can be read where there are none
+  const float *arriving, *cosine;              // (K, 3) linear, (K): of rays with a wall that mirrors; the same
+  const int32_t *behind_place, *mirror_place;  // (whole registers of R) a ray's row of these; -1: it has none
+  Glass glass;
+  int threads;
+};
+struct FarWallGradients {  // alpha: null without it; glass: (blocks, kGlassNumbers) partial sums
+  float *alpha, *behind, *arriving, *cosine, *glass;
+};
+
 #define RTGS_DECLARE_WALL_KERNELS(isa)                                                                    \
   namespace isa {                                                                                         \
   void wall_reflectance(const WallAngles&, float* reflected);                                             \
   void wall_reflectance_backward(const WallAngles&, const float* upstream, float* cosine, float* index);  \
   void wall_leg(const WallLeg&, float* arriving);                                                         \
   void wall_leg_backward(const WallLeg&, const float* upstream, const WallLegGradients&);                 \
-  }  // index: (blocks) partial sums
+  void far_wall(const FarWall&, float* color);                                                            \
+  void far_wall_backward(const FarWall&, const float* upstream, const FarWallGradients&);                 \
+  }  // index: (blocks) partial sums; color, upstream: (3, R)
 RTGS_DECLARE_WALL_KERNELS(portable)
 #if defined(__x86_64__)
 RTGS_DECLARE_WALL_KERNELS(avx2)
