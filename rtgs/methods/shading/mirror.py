@@ -55,11 +55,12 @@ def surface_pixels(
         alpha: (P,); depth: (P,) already the surface's; normal: (3, P).
         settings: whether roughness and f0 are divided by alpha (decision 8).
     """
-    diffuse, specular, roughness, f0 = features[:3], features[3], features[4], features[5:]
+    # Split: its gradient is put together once, those of slices are maps of zeros that are added up.
+    diffuse, specular, roughness, f0 = features.split((3, 1, 1, len(features) - 5))
+    specular, roughness, f0 = specular.squeeze(0), roughness.squeeze(0), f0.squeeze(0)
     if settings.normalized:
         cover = alpha.clamp_min(settings.smallest_alpha)
         roughness, f0 = roughness / cover, f0 / cover
-    f0 = f0[0] if len(f0) == 1 else f0
     return SurfacePixels(diffuse, specular, roughness, f0, normal, depth)
 
 

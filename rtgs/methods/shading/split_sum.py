@@ -37,9 +37,10 @@ class MetalPixels:
 
 def metal_pixels(features: Tensor) -> MetalPixels:
     """Split composited features (8, P), or (11, P) with indirect light."""
-    return MetalPixels(
-        features[:3], features[3], features[4], features[5:8], features[8:] if len(features) > 8 else None
-    )
+    # Split: its gradient is put together once, those of slices are maps of zeros that are added up.
+    diffuse, metalness, roughness, albedo, indirect = features.split((3, 1, 1, 3, len(features) - 8))
+    indirect = indirect if len(indirect) > 0 else None
+    return MetalPixels(diffuse, metalness.squeeze(0), roughness.squeeze(0), albedo, indirect)
 
 
 def mirrored_means(normal: Tensor, alpha: Tensor, view: Tensor, form: str) -> tuple[Tensor, Tensor]:
