@@ -1,7 +1,7 @@
 """How many threads the kernels take, and when torch's own operations take one.
 
 Waking a sleeping thread costs some 50 us. A kernel is worth that; hundreds of operations on a small picture are not:
-on two threads they take longer than on one (docs/lab/benchmarks.md).
+on two threads they take longer than on one (docs/lab/threads.md).
 """
 
 from __future__ import annotations
