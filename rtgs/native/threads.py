@@ -44,9 +44,15 @@ def serial_torch(wanted: bool = True) -> Iterator[None]:
 
 def in_threads(work: Callable[..., Result], *items: Iterable) -> list[Result]:
     """``work`` of the items, in their order, in as many of Python's threads as the kernels have: for calls that let go
-    of the interpreter (numpy, scipy, Embree; torch in :func:`serial_torch`)."""
+    of the interpreter (numpy, scipy, Embree; torch in :func:`serial_torch`). The threads do not inherit
+    ``torch.no_grad``, nor what :func:`threads` says here.
+
+    Raises:
+        ValueError: there are not as many of the one as of the other.
+    """
+    every = list(zip(*items, strict=True))
     with ThreadPoolExecutor(threads()) as workers:
-        return list(workers.map(work, *items))
+        return list(workers.map(lambda each: work(*each), every))
 
 
 @contextmanager

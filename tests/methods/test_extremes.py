@@ -30,7 +30,8 @@ BOUNDED = {  # the largest gradient by one input, for light and upstream within 
     "coated": OpticsSettings(fresnel="coated"),
 }
 OPEN = {"no bound": OpticsSettings(max_gain=0.0), "literal": OpticsSettings(weight="literal")}
-LARGEST_GRADIENT = 5e5
+LARGEST_GRADIENT = 1e5  # of a whole model
+LARGEST_OF_A_PIXEL = 1e6  # all drawn values together reach 5.4e5: 1 / SHORTEST_NORMAL times the slope at grazing
 
 share = st.sampled_from([0.0, 1e-30, 1e-6, 1e-3, 0.5, 1 - 1e-6, 1.0])  # k_s, roughness, f0: both ends and near them
 # Of the cosine between normal and view: straight on, grazing and just off it on either side, from behind.
@@ -105,7 +106,7 @@ def test_a_pixel_at_the_ends_of_every_range(name: str):
                 continue
             assert bool(gradient.isfinite().all()), field
             if name in BOUNDED:
-                assert float(gradient.abs().max()) < LARGEST_GRADIENT, field
+                assert float(gradient.abs().max()) < LARGEST_OF_A_PIXEL, field
 
     draw()
 

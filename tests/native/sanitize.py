@@ -22,6 +22,8 @@ TESTS = (
     "tests/gaussians/test_adam.py",
     "tests/train/test_losses.py",
     "tests/methods/test_mirror_native.py",
+    "tests/methods/test_blend_native.py",
+    "tests/methods/test_traced_pixels.py",
     "tests/methods/test_inner_native.py",
     "tests/methods/test_far_wall_native.py",
     "tests/methods/test_thread_bits.py",

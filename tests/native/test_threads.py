@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from rtgs.native import core
-from rtgs.native.threads import serial_torch, threaded_torch, threads
+from rtgs.native.threads import in_threads, serial_torch, threaded_torch, threads
 from tests.render.native_scene import SCENE_OPTIONS, native_scene
 from tests.render.native_trace_scene import everything, native_trace_scene
 
@@ -278,3 +278,12 @@ if child == 0:
 _, status = os.waitpid(child, 0)
 sys.exit(os.waitstatus_to_exitcode(status))
 """
+
+
+def test_work_in_threads_keeps_its_order_and_tells_what_went_wrong():
+    assert in_threads(lambda a, b: 10 * a + b, range(50), range(50)) == [11 * k for k in range(50)]
+    assert in_threads(abs, []) == []
+    with pytest.raises(ValueError, match="shorter"):
+        in_threads(lambda a, b: a, [1, 2, 3], [1])
+    with pytest.raises(ZeroDivisionError):
+        in_threads(lambda a: 1 / a, [2, 1, 0])
