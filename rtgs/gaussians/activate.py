@@ -13,6 +13,7 @@ from torch.autograd.function import once_differentiable
 from rtgs.gaussians.primitives import PARAMETERS, Gaussians
 from rtgs.gaussians.surfels import ActivatedGaussians
 from rtgs.native import core
+from rtgs.native.arrays import arrays_of
 from rtgs.native.threads import threads
 
 
@@ -64,11 +65,6 @@ def activate_geometry(gaussians: Gaussians) -> ActivatedGaussians:
     return ActivatedGaussians(gaussians.means, *_Activate.apply(None, (0.0, 0.0, 0.0), 0, *raw))
 
 
-def arrays(tensors: tuple[Tensor, ...]) -> tuple:
-    """Contiguous numpy views for a native call."""
-    return tuple(tensor.detach().contiguous().numpy() for tensor in tensors)
-
-
 class _Activate(torch.autograd.Function):
     @staticmethod
     def forward(ctx, learned: Tensor | None, center: tuple[float, float, float], degree: int, *raw: Tensor):
@@ -78,11 +74,11 @@ class _Activate(torch.autograd.Function):
         needs_backward = any(ctx.needs_input_grad)
         saved = rows(core.activation_saved_size(count)) if needs_backward else None
         core.activate_gaussians(
-            arrays(raw),
+            arrays_of(*raw),
             center,
             degree,
-            arrays(outputs),
-            None if saved is None else saved.numpy(),
+            arrays_of(*outputs),
+            *arrays_of(saved),
             threads(),
         )
         if saved is not None:
@@ -96,12 +92,12 @@ class _Activate(torch.autograd.Function):
         *raw, scales, saved = ctx.saved_tensors
         gradients = tuple(torch.empty_like(tensor, memory_format=torch.contiguous_format) for tensor in raw)
         core.activate_gaussians_backward(
-            arrays(tuple(raw)),
+            arrays_of(*raw),
             ctx.center,
             ctx.degree,
-            *arrays((scales, saved)),
-            arrays(upstream),
-            arrays(gradients),
+            *arrays_of(scales, saved),
+            arrays_of(*upstream),
+            arrays_of(*gradients),
             threads(),
         )
         by_center = None

@@ -6,12 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import ConvexHull
 
 from rtgs.core.cameras import Camera
 from rtgs.core.errors import RtgsError
 from rtgs.mesh.container import ObjectMesh
 from rtgs.mesh.guide import MeshGuide
-from rtgs.mesh.hull import carve_hull, most_outvoted
+from rtgs.mesh.hull import _convex_distance, carve_hull, most_outvoted
+from rtgs.mesh.outlines import plain_outlines
+from rtgs.mesh.pane import _agreements, _plane
 from rtgs.mesh.score import hit_score, mesh_distance, triangle_distance
 from rtgs.mesh.settings import HullSettings
 from rtgs.mesh.silhouettes import MaskSet, direction_spread, focus_point, mask_set, silhouette_score
@@ -241,3 +244,43 @@ def test_distances_between_meshes() -> None:
     corners = np.array([[[0, 0, 0], [1, 0, 0], [0, 1, 0]]] * 3, float)
     points = np.array([[0.2, 0.2, 0.5], [2.0, 0.0, 0.0], [-0.3, -0.4, 0.0]])
     np.testing.assert_allclose(triangle_distance(points, corners), [0.5, 1.0, 0.5])
+
+
+@pytest.mark.parametrize("count", [0, 1, 2047, 5000])
+def test_distance_to_a_convex_hull_is_that_to_the_nearest_of_its_planes(count: int) -> None:
+    generator = np.random.default_rng(count)
+    centres, points = generator.normal(size=(400, 3)), 2 * generator.normal(size=(count, 3))
+    planes = ConvexHull(centres).equations.round(6)
+    outside = (points[:, None] * planes[None, :, :3]).sum(2) + planes[:, 3]
+    found = _convex_distance(points, centres, 0.1)
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found, 0.05 - outside.max(1), rtol=1e-6, atol=1e-6)
+
+
+def test_threads_find_the_same_hull_and_scores() -> None:
+    masks, before, found = masks_of(sphere(0.8, 32), ring(12)), torch.get_num_threads(), []
+    try:
+        for threads in (1, 3):
+            torch.set_num_threads(threads)
+            mesh = carve_hull(masks, COARSE).mesh
+            found.append((mesh, silhouette_score(mesh, masks.views)))
+    finally:
+        torch.set_num_threads(before)
+    (one, score), (other, again) = found
+    assert np.array_equal(one.vertices, other.vertices)
+    assert np.array_equal(one.faces, other.faces)
+    assert score == again
+
+
+def test_planes_agree_together_as_one_by_one() -> None:
+    body = box((-0.5, -0.5, -0.01), (0.5, 0.5, 0.01))
+    outlines = plain_outlines(masks_of(body, ring(12)).views)
+    away = np.array([0.0, 0.0, 100.0])  # that no view has in its picture
+    planes = [
+        _plane(center, np.array(normal), 0.9) for center in (np.zeros(3), away) for normal in ((0, 0, 1), (1, 0, 0.3))
+    ]
+    found = _agreements(outlines, planes, 20)
+    assert found == pytest.approx([_agreements(outlines, [plane], 20)[0] for plane in planes], abs=1e-6)
+    assert found[0] > 0.8
+    assert found[0] > found[1]
+    assert found[2:] == [0.0, 0.0]

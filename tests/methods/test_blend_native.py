@@ -11,6 +11,7 @@ from torch import Tensor
 
 from rtgs.methods.shading.blend import MOST_LIGHTS, Blend, blended, blended_twin
 from rtgs.methods.shading.pixel_maps import taken
+from rtgs.methods.shading.traced_pixels import TracedPixels
 from rtgs.native import core
 
 SIZES = ((0, 1), (1, 1), (15, 40), (16, 16), (33, 64), (500, 1200))  # traced pixels, all pixels
@@ -30,7 +31,7 @@ class Case:
         diffuse, specular, *rest = leaves = [each.to(dtype).clone().requires_grad_() for each in self.leaves]
         emphasis = None if self.emphasis is None else self.emphasis.to(dtype)
         lights = list(zip(rest[::2], rest[1::2], strict=True))
-        image = function(diffuse, specular, lights, self.index, emphasis, blend)
+        image = function(diffuse, specular, lights, TracedPixels(self.index, emphasis), blend)
         gradients = torch.autograd.grad(image, leaves, self.upstream.to(dtype), allow_unused=True)
         return (image.detach(), *(torch.zeros_like(e) if g is None else g for e, g in zip(leaves, gradients)))
 
@@ -77,23 +78,50 @@ def test_any_number_of_lights(planes):
     assert all(close(found, wanted) for found, wanted in zip(case.image(blended, blend), exact, strict=True))
 
 
-def test_gradients_that_nobody_wants_are_not_made():
-    case, blend = drawn(33, 64), Blend("linear", additive=False)
+def test_gradients_that_nobody_wants_are_not_made(monkeypatch):
+    case, blend, asked = drawn(33, 64), Blend("linear", additive=False), []
     diffuse, specular, weight, color, *_ = (each.clone() for each in case.leaves)
     color.requires_grad_()
-    (gradient,) = torch.autograd.grad(
-        blended(diffuse, specular, [(weight, color)], case.index, None, blend), color, case.upstream
-    )
+
+    class Asked:
+        def __getattr__(self, name: str):
+            def called(*arguments):
+                asked.append(arguments)
+                return getattr(core, name)(*arguments)
+
+            return called
+
+    monkeypatch.setattr("rtgs.methods.shading.blend.core", Asked())
+    image = blended(diffuse, specular, [(weight, color)], TracedPixels(case.index, None), blend)
+    (gradient,) = torch.autograd.grad(image, color, case.upstream)
+    (*_, to_diffuse, to_specular, to_weights, to_colors, _) = asked[-1]
+    assert (to_diffuse, to_specular, list(to_weights)) == (None, None, [None])
+    assert to_colors[0] is not None
     alone = Case(case.index, case.leaves[:4], None, case.upstream).image(blended_twin, blend, torch.float64)
     assert close(gradient, alone[4])
 
 
-def test_what_is_not_a_number_stays_in_its_pixel():
-    case, blend = drawn(33, 64, (1,)), Blend("linear", additive=False)
-    case.leaves[3][1, 5] = torch.nan
+@pytest.mark.usefixtures("isa")
+@pytest.mark.parametrize("space", ["srgb", "linear"])
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
+@pytest.mark.parametrize("leaf", [0, 1, 2, 3])
+def test_what_is_not_finite_is_seen_and_stays_in_its_pixel(leaf: int, value: float, space: str):
+    case, blend = drawn(33, 64, (1,)), Blend(space, additive=False)
+    whole, at = case.image(blended, blend)[0], int(case.index[5])
+    broken = case.leaves[leaf]
+    broken.view(-1, broken.shape[-1])[0, at if leaf == 0 else 5] = value
     image = case.image(blended, blend)[0]
-    assert bool(image[1, case.index[5]].isnan())
-    assert int(image.isnan().sum()) == 1
+    assert not bool(image[:, at].isfinite().all())
+    rest = torch.arange(64) != at
+    assert torch.equal(image[:, rest], whole[:, rest])
+
+
+def test_weights_of_another_shape_are_those_of_the_twin():
+    generator = torch.Generator().manual_seed(2)
+    diffuse, color = torch.rand(2, 3, 3, generator=generator)
+    weight, chosen = torch.rand(3, 1, generator=generator), TracedPixels(torch.arange(3), None)
+    given = (diffuse, torch.full((3,), 0.5), [(weight, color)], chosen, Blend("srgb", additive=False))
+    assert torch.equal(blended(*given), blended_twin(*given))
 
 
 @pytest.mark.usefixtures("isa")
@@ -102,10 +130,12 @@ def test_threads_and_places_change_nothing(space):
     case, blend = drawn(20_001, 30_000, emphasized=True), Blend(space, additive=False)
     turned = case.index.flip(0)
     before, found = torch.get_num_threads(), []
-    for threads in (1, 2, 3):
-        torch.set_num_threads(threads)
-        found.append(case.image(blended, blend))
-    torch.set_num_threads(before)
+    try:
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            found.append(case.image(blended, blend))
+    finally:
+        torch.set_num_threads(before)
     for other in found[1:]:
         assert all(torch.equal(one, each) for one, each in zip(found[0], other, strict=True))
     flipped = (case.leaves[0], *(each.flip(-1) for each in case.leaves[1:]))
@@ -139,12 +169,13 @@ def test_taken_pixels_are_those_of_the_index_and_so_are_their_gradients(traced, 
 
 def test_many_threads_take_the_same_pixels():
     index, values = torch.randperm(50_000)[:40_000], torch.rand(3, 50_000)
-    before = torch.get_num_threads()
-    torch.set_num_threads(3)
-    leaf = values.clone().requires_grad_()
-    (rows,) = taken([leaf], index)
-    rows.backward(rows.detach())
-    torch.set_num_threads(before)
+    before, leaf = torch.get_num_threads(), values.clone().requires_grad_()
+    try:
+        torch.set_num_threads(3)
+        (rows,) = taken([leaf], index)
+        rows.backward(rows.detach())
+    finally:
+        torch.set_num_threads(before)
     assert torch.equal(rows.detach(), values.index_select(1, index))
     assert leaf.grad is not None
     assert torch.equal(leaf.grad, torch.zeros_like(values).index_copy(1, index, rows.detach()))

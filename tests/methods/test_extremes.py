@@ -15,6 +15,7 @@ from torch import Tensor
 from rtgs.methods import Mode, RenderOptions, Stage
 from rtgs.methods.shading.blend import Blend, blended
 from rtgs.methods.shading.mirror import SHORTEST_NORMAL, SurfacePixels, mirror_rays, reflected_weight
+from rtgs.methods.shading.traced_pixels import TracedPixels
 from rtgs.optics.settings import OpticsSettings
 
 TOWARDS = torch.tensor([0.0, 0.0, -1.0])  # the camera, from what it sees straight ahead
@@ -90,8 +91,8 @@ def test_a_pixel_at_the_ends_of_every_range(name: str):
         rays = mirror_rays(given_maps, torch.zeros(3), view)
         color = torch.linspace(1, 0, len(drawn)).expand(3, -1)
         light = (reflected_weight(rays.cosine, given_maps, optics), color)
-        rows, how = torch.arange(len(drawn)), Blend("srgb", additive=False)
-        image = blended(given_maps.diffuse, given_maps.specular, [light], rows, None, how)
+        chosen, how = TracedPixels(torch.arange(len(drawn)), None), Blend("srgb", additive=False)
+        image = blended(given_maps.diffuse, given_maps.specular, [light], chosen, how)
         for values in (rays.origins, rays.directions, rays.cosine, image):
             assert bool(values.isfinite().all())
         lengths = torch.tensor([p.length for p in drawn])

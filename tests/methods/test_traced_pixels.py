@@ -136,11 +136,11 @@ def test_the_native_order_refuses_what_does_not_fit():
         core.PixelOrder(index, quad, corner + 1)
     with pytest.raises(ValueError, match="quad holds 3 numbers, expected 8"):
         core.PixelOrder(index, quad[:3], corner)
-    rows, places = np.zeros(9, np.int64), np.zeros(9, np.int32)
+    rows, places = np.zeros(8, np.int64), np.zeros(8, np.int32)
     with pytest.raises(ValueError, match="surface holds 7 numbers, expected 8"):
         order.native.choose(np.ones(7, bool), None, rows, places)
-    with pytest.raises(ValueError, match="index holds 8 numbers, expected 9"):
-        order.native.choose(np.ones(8, bool), None, rows[:8], places)
+    with pytest.raises(ValueError, match="index holds 7 numbers, expected 8"):
+        order.native.choose(np.ones(8, bool), None, rows[:7], places)
     showing = np.zeros(8, np.float32)
     with pytest.raises(ValueError, match="place holds 8, which is not in"):
         order.native.share(8, rows, places + 8, showing, 1.0, 0, rows.copy(), rows.copy())

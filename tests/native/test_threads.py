@@ -79,6 +79,26 @@ def _far_wall(threads: int) -> None:
     core.far_wall(_floats(3, 4), given, rows, (1.5, None), _floats(3, 4), threads)
 
 
+def _far_wall_backward(threads: int) -> None:
+    given, rows = (None, _floats(2, 3), _floats(0, 3), _floats(0)), (np.arange(2), np.zeros(0, np.int64))
+    core.far_wall_backward(_floats(3, 4), given, rows, (1.5, None), _floats(3, 4), given, _floats(4), threads)
+
+
+def _leg_backward(threads: int) -> None:
+    leg = _floats(4, 3), _floats(4), _floats(4, 3), None, _floats(4)
+    core.wall_leg_backward(leg, _floats(4), (1.5, None), _floats(4, 3), leg, _floats(4), threads)
+
+
+def _blend(threads: int) -> None:
+    light = [_floats(2)], [_floats(3, 2)], None, True, False
+    core.blend_lights(np.arange(2), _floats(3, 4), _floats(2), *light, _floats(3, 4), threads)
+
+
+def _blend_backward(threads: int) -> None:
+    light, to = ([_floats(2)], [_floats(3, 2)], None, True, False), (None, None, [None], [None])
+    core.blend_lights_backward(np.arange(2), _floats(3, 4), _floats(2), *light, _floats(3, 4), *to, threads)
+
+
 CALLS = {
     "rasterise surfels": _raster,
     "rasterise ellipsoids": _ellipsoids,
@@ -116,6 +136,15 @@ CALLS = {
         (_floats(4, 3), _floats(4), _floats(4, 3), None, _floats(4)), _floats(4), (1.5, None), _floats(4, 3), threads
     ),
     "far wall": _far_wall,
+    "wall, backward": lambda threads: core.wall_reflectance_backward(
+        _floats(4), 1.5, _floats(4), _floats(4), _floats(1), threads
+    ),
+    "wall leg, backward": _leg_backward,
+    "far wall, backward": _far_wall_backward,
+    "blend": _blend,
+    "blend, backward": _blend_backward,
+    "take": lambda threads: core.take_planes(np.arange(2), 4, [_floats(4)], [_floats(2)], threads),
+    "put": lambda threads: core.put_planes(np.arange(2), 4, [_floats(2)], [_floats(4)], threads),
     "encode": lambda threads: core.srgb_encode(_floats(4), _floats(4), threads),
     "cube lookup": lambda threads: core.cube_lookup(
         _floats(6 * 16, 4), np.array([2], np.int32), _floats(4, 3), _floats(0), _floats(4, 3), threads

@@ -15,8 +15,9 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from rtgs.methods.shading.inner import LINEAR, arrays_of, far_wall
+from rtgs.methods.shading.inner import LINEAR, far_wall
 from rtgs.native import core
+from rtgs.native.arrays import arrays_of
 from rtgs.native.threads import threads
 from rtgs.optics.dielectric import all_native, glass_numbers
 from rtgs.optics.light import decoded, encoded

@@ -18,6 +18,7 @@ from torch.autograd.function import once_differentiable
 
 from rtgs.mesh.inner_paths import InnerPaths, Leg
 from rtgs.native import core
+from rtgs.native.arrays import arrays_of
 from rtgs.native.threads import threads
 from rtgs.optics.dielectric import all_native, glass_numbers, passed, wall_reflectance
 from rtgs.optics.light import decoded, encoded
@@ -97,11 +98,6 @@ def far_wall(
     through = passed(reflected, 1.0, tint)
     passing = torch.ones(len(behind), through.shape[1], dtype=behind.dtype).index_copy(0, rows, through)
     return (passing * behind).index_add(0, rows, reflected * arriving)
-
-
-def arrays_of(*tensors: Tensor | None) -> tuple:
-    """What a kernel takes of them."""
-    return tuple(None if each is None else each.detach().contiguous().numpy() for each in tensors)
 
 
 class _LegLight(torch.autograd.Function):

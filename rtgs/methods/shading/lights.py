@@ -77,7 +77,7 @@ def lit_view(frame: Frame, raster: Raster, traced: Traced, optics: OpticsSetting
     """The view with its lights; the image of pixels that were not traced is C_d."""
     camera, flat, chosen, pixels, blend = frame.camera, traced.flat, traced.chosen, traced.pixels, optics.blend
     lights = [light.weighted for light in traced.lights]
-    image = blended(flat.diffuse, pixels.specular, lights, chosen.index, chosen.emphasis, Blend(blend, optics.additive))
+    image = blended(flat.diffuse, pixels.specular, lights, chosen, Blend(blend, optics.additive))
     shape = (3, camera.height, camera.width)
     layers = None
     if frame.options.layers:

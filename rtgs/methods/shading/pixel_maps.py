@@ -11,6 +11,7 @@ from torch.autograd.function import once_differentiable
 from rtgs.methods.shading.mirror import SurfacePixels
 from rtgs.methods.shading.traced_pixels import TracedPixels
 from rtgs.native import core
+from rtgs.native.arrays import arrays_of
 from rtgs.native.threads import threads
 
 
@@ -50,12 +51,10 @@ class _Taken(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, index: Tensor, *maps: Tensor) -> tuple[Tensor, ...]:
-        given = [each.detach().contiguous() for each in maps]
-        rows = tuple(each.new_empty(*each.shape[:-1], len(index)) for each in given)
-        size = given[0].shape[-1]
-        core.take_planes(index.numpy(), size, [each.numpy() for each in given], [r.numpy() for r in rows], threads())
+        rows = tuple(each.new_empty(*each.shape[:-1], len(index)) for each in maps)
+        core.take_planes(*arrays_of(index), maps[0].shape[-1], arrays_of(*maps), arrays_of(*rows), threads())
         ctx.save_for_backward(index)
-        ctx.shapes = [each.shape for each in given]
+        ctx.shapes = [each.shape for each in maps]
         ctx.set_materialize_grads(False)
         return rows
 
@@ -65,9 +64,8 @@ class _Taken(torch.autograd.Function):
         (index,) = ctx.saved_tensors
         pairs = zip(ctx.shapes, upstream, ctx.needs_input_grad[1:], strict=True)
         maps = [torch.empty(shape) if needed and given is not None else None for shape, given, needed in pairs]
-        used = [(each, given) for each, given in zip(maps, upstream, strict=True) if each is not None]
-        if used:
-            rows = [given.contiguous().numpy() for _, given in used]  # type: ignore[union-attr]
-            size = ctx.shapes[0][-1]
-            core.put_planes(index.numpy(), size, rows, [each.numpy() for each, _ in used], threads())
+        filled = [each for each in maps if each is not None]
+        rows = [given for each, given in zip(maps, upstream, strict=True) if each is not None]
+        if filled:
+            core.put_planes(*arrays_of(index), filled[0].shape[-1], arrays_of(*rows), arrays_of(*filled), threads())
         return None, *maps

@@ -115,7 +115,7 @@ def ordered_pixels(order: TileOrder, surface: Tensor, kept: Tensor | None, share
         share: None: every pixel has a ray of its own.
     """
     pixels = len(order.index)
-    index, place = torch.empty(pixels + 1, dtype=torch.int64), torch.empty(pixels + 1, dtype=torch.int32)
+    index, place = torch.empty(pixels, dtype=torch.int64), torch.empty(pixels, dtype=torch.int32)
     flags = None if kept is None else kept.contiguous().numpy()
     count = order.native.choose(surface.contiguous().numpy(), flags, index.numpy(), place.numpy())
     if share is None:

@@ -30,11 +30,28 @@ TracedIndex traced_index(const Index& index, int64_t pixels, int threads) {
   return {pixels, count, index.data(), checked_threads(threads)};
 }
 
-// Planes of `size` numbers each; of an array that is not there, `planes` null pointers.
-void append_planes(std::vector<float*>& to, const MaybeFloats& array, int64_t planes, int64_t size, const char* name) {
-  if (array) require("blend", *array, name, planes * size);
-  for (int64_t k = 0; k < planes; ++k) to.push_back(array ? array->data() + k * size : nullptr);
-}
+using Planes = std::vector<Floats>;
+
+// The planes of some arrays, of `size` numbers each.
+class PlaneList {
+ public:
+  PlaneList(const Planes& maps, const Planes& rows, const TracedIndex& at) {
+    if (maps.size() != rows.size()) throw std::invalid_argument("planes: as many maps as rows");
+    for (size_t k = 0; k < maps.size(); ++k) {
+      const int64_t planes = at.pixels ? int64_t(maps[k].size()) / at.pixels : 0;
+      append(maps_, maps[k], planes, at.pixels, "a map");
+      append(rows_, rows[k], planes, at.count, "its rows");
+    }
+  }
+  PixelPlanes planes() const { return {int(maps_.size()), maps_.data(), rows_.data()}; }
+
+ private:
+  static void append(std::vector<float*>& to, const Floats& array, int64_t planes, int64_t size, const char* name) {
+    require("planes", array, name, planes * size);
+    for (int64_t k = 0; k < planes; ++k) to.push_back(array.data() + k * size);
+  }
+  std::vector<float*> maps_, rows_;
+};
 
 float* data_of(const MaybeFloats& array, const char* name, int64_t size) {
   if (!array) return nullptr;
@@ -58,7 +75,7 @@ BlendedPixels blended_pixels(const TracedIndex& at, const MaybeFloats& diffuse, 
 }
 
 BlendedPixels given_pixels(const TracedIndex& at, const Floats& diffuse, const Floats& specular,
-                           const std::vector<Floats>& weights, const std::vector<Floats>& colors) {
+                           const Planes& weights, const Planes& colors) {
   return blended_pixels(at, diffuse, specular, Arrays(weights.begin(), weights.end()),
                         Arrays(colors.begin(), colors.end()));
 }
@@ -66,36 +83,22 @@ BlendedPixels given_pixels(const TracedIndex& at, const Floats& diffuse, const F
 }  // namespace
 
 void bind_blend(nb::module_& m) {
-  m.def("take_planes", [](Index index, int64_t pixels, std::vector<Floats> maps, std::vector<Floats> rows, int threads) {
+  m.def("take_planes", [](Index index, int64_t pixels, Planes maps, Planes rows, int threads) {
     const TracedIndex at = traced_index(index, pixels, threads);
-    if (maps.size() != rows.size()) throw std::invalid_argument("take_planes: as many maps as rows");
-    std::vector<float*> from, to;
-    for (size_t k = 0; k < maps.size(); ++k) {
-      const int64_t planes = pixels ? int64_t(maps[k].size()) / pixels : 0;
-      append_planes(from, maps[k], planes, pixels, "a map");
-      append_planes(to, rows[k], planes, at.count, "its rows");
-    }
+    const PlaneList list(maps, rows, at);
     nb::gil_scoped_release release;
-    take_planes(at, {int(from.size()), from.data(), to.data()});
+    take_planes(at, list.planes());
   }, nb::arg("index"), nb::arg("pixels"), nb::arg("maps"), nb::arg("rows"), nb::arg("threads"),
      "Fills rows (C, P) with what each of the maps (C, N) holds at the index (P).");
-  m.def("put_planes", [](Index index, int64_t pixels, Arrays rows, std::vector<Floats> maps,
-                         int threads) {
+  m.def("put_planes", [](Index index, int64_t pixels, Planes rows, Planes maps, int threads) {
     const TracedIndex at = traced_index(index, pixels, threads);
-    if (maps.size() != rows.size()) throw std::invalid_argument("put_planes: as many maps as rows");
-    std::vector<float*> from, to;
-    for (size_t k = 0; k < maps.size(); ++k) {
-      const int64_t planes = pixels ? int64_t(maps[k].size()) / pixels : 0;
-      append_planes(from, rows[k], planes, at.count, "rows");
-      append_planes(to, maps[k], planes, pixels, "their map");
-    }
+    const PlaneList list(maps, rows, at);
     nb::gil_scoped_release release;
-    put_planes(at, {int(to.size()), to.data(), from.data()});
-  }, nb::arg("index"), nb::arg("pixels"), nb::arg("rows").none(), nb::arg("maps"), nb::arg("threads"),
-     "Fills maps (C, N) with rows (C, P) at the index (P), none twice, and with 0 elsewhere; None: with 0.");
-  m.def("blend_lights", [](Index index, Floats diffuse, Floats specular, std::vector<Floats> weights,
-                           std::vector<Floats> colors, MaybeFloats emphasis, bool linear, bool additive,
-                           Floats image, int threads) {
+    put_planes(at, list.planes());
+  }, nb::arg("index"), nb::arg("pixels"), nb::arg("rows"), nb::arg("maps"), nb::arg("threads"),
+     "Fills maps (C, N) with rows (C, P) at the index (P), none twice, and with 0 elsewhere.");
+  m.def("blend_lights", [](Index index, Floats diffuse, Floats specular, Planes weights, Planes colors,
+                           MaybeFloats emphasis, bool linear, bool additive, Floats image, int threads) {
     const TracedIndex at = traced_index(index, int64_t(diffuse.size()) / 3, threads);
     const BlendedPixels in = given_pixels(at, diffuse, specular, weights, colors);
     const BlendRules rules = {int(weights.size()), linear, additive, data_of(emphasis, "emphasis", at.count)};
@@ -105,11 +108,10 @@ void bind_blend(nb::module_& m) {
   }, nb::arg("index"), nb::arg("diffuse"), nb::arg("specular"), nb::arg("weights"), nb::arg("colors"),
      nb::arg("emphasis").none(), nb::arg("linear"), nb::arg("additive"), nb::arg("image"), nb::arg("threads"),
      "Fills the image (3, N) of C_d and the lights of P traced pixels; see rtgs/methods/shading/blend.py.");
-  m.def("blend_lights_backward", [](Index index, Floats diffuse, Floats specular,
-                                    std::vector<Floats> weights, std::vector<Floats> colors, MaybeFloats emphasis, bool linear, bool additive,
-                                    Floats upstream, MaybeFloats to_diffuse, MaybeFloats to_specular,
-                                    Arrays to_weights, Arrays to_colors,
-                                    int threads) {
+  m.def("blend_lights_backward", [](Index index, Floats diffuse, Floats specular, Planes weights, Planes colors,
+                                    MaybeFloats emphasis, bool linear, bool additive, Floats upstream,
+                                    MaybeFloats to_diffuse, MaybeFloats to_specular, Arrays to_weights,
+                                    Arrays to_colors, int threads) {
     const TracedIndex at = traced_index(index, int64_t(diffuse.size()) / 3, threads);
     const BlendedPixels in = given_pixels(at, diffuse, specular, weights, colors);
     BlendedPixels out = blended_pixels(at, to_diffuse, to_specular, to_weights, to_colors);

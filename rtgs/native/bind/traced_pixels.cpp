@@ -48,8 +48,8 @@ class Order {
     const PixelOrder order = pixels();
     require(kName, surface, "surface", order.count);
     if (kept) require(kName, *kept, "kept", order.count);
-    require(kName, index, "index", order.count + 1);  // the passes write one place ahead
-    require(kName, place, "place", order.count + 1);
+    require(kName, index, "index", order.count);
+    require(kName, place, "place", order.count);
     nb::gil_scoped_release release;
     return choose_pixels(order, surface.data(), kept ? kept->data() : nullptr, index.data(), place.data());
   }
@@ -57,11 +57,11 @@ class Order {
   int64_t share(int64_t count, Rows index, Places place, Floats showing, float below, int turn, Rows own,
                 Rows ray) const {
     const PixelOrder order = pixels();
-    require(kName, index, "index", order.count + 1);
-    require(kName, place, "place", order.count + 1);
+    require(kName, index, "index", order.count);
+    require(kName, place, "place", order.count);
     require(kName, showing, "showing", order.count);
-    require(kName, own, "own", order.count + 1);
-    require(kName, ray, "ray", order.count + 1);
+    require(kName, own, "own", order.count);
+    require(kName, ray, "ray", order.count);
     if (count < 0 || count > order.count) throw std::invalid_argument("traced pixels: more are chosen than there are");
     check_range(place.data(), count, order.count, "place");
     check_range(index.data(), count, order.count, "index");
@@ -84,10 +84,10 @@ void bind_traced_pixels(nb::module_& m) {
   nb::class_<Order>(m, "PixelOrder", "An order of an image's N pixels; see rtgs/methods/shading/traced_pixels.py.")
       .def(nb::init<Indices, Indices, Indices>(), nb::arg("index"), nb::arg("quad"), nb::arg("corner"))
       .def("choose", &Order::choose, nb::arg("surface"), nb::arg("kept").none(), nb::arg("index"), nb::arg("place"),
-           "Fills index and place (N + 1) with the pixels on the surface (N) that are kept; returns how many they are.")
+           "Fills index and place (N) with the pixels on the surface (N) that are kept; returns how many they are.")
       .def("share", &Order::share, nb::arg("count"), nb::arg("index"), nb::arg("place"), nb::arg("showing"),
            nb::arg("below"), nb::arg("turn"), nb::arg("own"), nb::arg("ray"),
-           "Fills own and ray (N + 1) for the first `count` chosen pixels; returns how many rays they have.");
+           "Fills own and ray (N) for the first `count` chosen pixels; returns how many rays they have.");
 }
 
 }  // namespace rtgs

@@ -1,7 +1,6 @@
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 
-#include <algorithm>
 #include <optional>
 #include <tuple>
 #include <vector>
@@ -165,7 +164,8 @@ void bind_wall(nb::module_& m) {
     nb::gil_scoped_release release;
     RTGS_DISPATCH(far_wall, rays.in, out);
   }, nb::arg("contents"), nb::arg("given"), nb::arg("rows").noconvert(), nb::arg("glass"), nb::arg("color"),
-     nb::arg("threads"), "Fills the colors (3, R) of contents (3, R) and what the far wall sends; given: alpha or None, behind, arriving "
+     nb::arg("threads"),
+     "Fills the colors (3, R) of contents (3, R) and what the far wall sends; given: alpha or None, behind, arriving "
      "light, cosine; rows: rays of behind, of arriving light; see rtgs/methods/shading/far_wall.py.");
   m.def("far_wall_backward", [](Floats contents, BehindArrays given, TwoRows rows, GlassNumbers glass, Floats upstream,
                                 BehindArrays gradients, Floats to_glass, int threads) {

@@ -33,6 +33,9 @@ inline void in_parts(int parts, const Work& work) {
   if (region.failed) out_of_memory();
 }
 
+// How many of the threads a quick pass over so many numbers is worth.
+inline int worth(int threads, int64_t numbers) { return numbers > 16384 ? threads : 1; }
+
 // work(begin, end) of 0 .. count - 1, a share for each thread.
 template <class Work>
 inline void in_shares(int threads, int64_t count, const Work& work) {

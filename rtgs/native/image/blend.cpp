@@ -9,7 +9,7 @@
 namespace rtgs::RTGS_ISA {
 namespace {
 
-inline vfloat to_light(vfloat color, bool linear) { return linear ? decoded(color) : color; }
+inline Curve to_light(vfloat color, bool linear) { return linear ? decode_curve(color) : Curve{color, broadcast(1.f)}; }
 
 struct Place {  // of kLanes traced pixels
   int64_t first;
@@ -38,17 +38,13 @@ inline vfloat sum_of_lights(const TracedIndex& at, const BlendRules& rules, cons
                             int channel) {
   vfloat lights = broadcast(0.f);
   for (int k = 0; k < rules.lights; ++k) {
-    const vfloat light = to_light(color_of(in.lights[k], at, here, channel), rules.linear);
+    const vfloat light = to_light(color_of(in.lights[k], at, here, channel), rules.linear).value;
     lights = fma(weight_of(in.lights[k], at, here, channel), light, lights);
   }
   return lights;
 }
 inline vfloat mixture(const BlendRules& rules, vfloat specular, vfloat base, vfloat lights) {
   return fma(specular, rules.additive ? lights : lights - base, base);
-}
-
-inline Curve to_light_curve(vfloat color, bool linear) {
-  return linear ? decode_curve(color) : Curve{color, broadcast(1.f)};
 }
 
 void copy(const TracedIndex& at, const float* from, float* to) {
@@ -61,13 +57,13 @@ void copy(const TracedIndex& at, const float* from, float* to) {
 
 void blend_lights(const TracedIndex& at, const BlendRules& rules, const BlendedPixels& in, float* image) {
   copy(at, in.diffuse, image);
-  each_block(at.threads, at.count, kLanes, [&](int64_t first) {
+  each_block(worth(at.threads, at.count), at.count, kLanes, [&](int64_t first) {
     const Place here(at, first);
     const vfloat specular = here.row(in.specular);
     for (int c = 0; c < 3; ++c) {
-      const vfloat base = to_light(gather(in.diffuse + c * at.pixels, here.pixel), rules.linear);
+      const vfloat base = to_light(gather(in.diffuse + c * at.pixels, here.pixel), rules.linear).value;
       const vfloat mixed = mixture(rules, specular, base, sum_of_lights(at, rules, in, here, c));
-      scatter(image + c * at.pixels, here.pixel, rules.linear ? encoded(mixed) : mixed, here.exists);
+      scatter(image + c * at.pixels, here.pixel, rules.linear ? encode_curve(mixed).value : mixed, here.exists);
     }
   });
 }
@@ -94,10 +90,10 @@ class BlendBackward {  // of kLanes traced pixels
     Curve light[kMostLights];
     vfloat lights = broadcast(0.f);
     for (int k = 0; k < rules_.lights; ++k) {
-      light[k] = to_light_curve(color_of(in_.lights[k], at_, here_, c), rules_.linear);
+      light[k] = to_light(color_of(in_.lights[k], at_, here_, c), rules_.linear);
       lights = fma(weight_of(in_.lights[k], at_, here_, c), light[k].value, lights);
     }
-    const Curve base = to_light_curve(gather(in_.diffuse + c * at_.pixels, here_.pixel), rules_.linear);
+    const Curve base = to_light(gather(in_.diffuse + c * at_.pixels, here_.pixel), rules_.linear);
     const vfloat to_change = given * emphasis_;
     vfloat to_mixed = to_change;
     if (rules_.linear) to_mixed *= encode_curve(mixture(rules_, specular_, base.value, lights)).slope;
@@ -132,7 +128,7 @@ class BlendBackward {  // of kLanes traced pixels
 void blend_lights_backward(const TracedIndex& at, const BlendRules& rules, const BlendedPixels& in,
                            const float* upstream, const BlendedPixels& out) {
   if (out.diffuse) copy(at, upstream, out.diffuse);
-  each_block(at.threads, at.count, kLanes, [&](int64_t first) {
+  each_block(worth(at.threads, at.count), at.count, kLanes, [&](int64_t first) {
     BlendBackward(at, rules, in, out, first).run(upstream);
   });
 }

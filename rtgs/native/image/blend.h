@@ -34,7 +34,7 @@ struct BlendRules {
 struct PixelPlanes {
   int count;
   float* const* planes;
-  float* const* rows;  // put_planes: a null pointer stands for zeros
+  float* const* rows;
 };
 void take_planes(const TracedIndex&, const PixelPlanes&);
 void put_planes(const TracedIndex&, const PixelPlanes&);

@@ -30,8 +30,7 @@ void put_planes(const TracedIndex& at, const PixelPlanes& maps) {
     for (int k = 0; k < maps.count; ++k) {
       const float* from = maps.rows[k];
       float* to = maps.planes[k];
-      if (from)
-        for (int64_t row = begin; row < end; ++row) to[at.index[row]] = from[row];
+      for (int64_t row = begin; row < end; ++row) to[at.index[row]] = from[row];
     }
   });
 }

@@ -9,12 +9,9 @@
 namespace rtgs::RTGS_ISA {
 namespace {
 
-constexpr int64_t kWorthThreads = 16384;
-
 template <typename F>
 inline void for_groups(const SrgbNumbers& in, const F& result) {  // result(numbers, first, lanes)
-  const int threads = in.count > kWorthThreads ? in.threads : 1;
-  each_block(threads, in.count, kLanes, [&](int64_t first) {
+  each_block(worth(in.threads, in.count), in.count, kLanes, [&](int64_t first) {
     const int lanes = int(in.count - first < kLanes ? in.count - first : kLanes);
     store_first(in.to + first, result(load_first(in.from + first, lanes), first, lanes), lanes);
   });
@@ -23,16 +20,20 @@ inline void for_groups(const SrgbNumbers& in, const F& result) {  // result(numb
 }  // namespace
 
 void srgb_decode(const SrgbNumbers& in) {
-  for_groups(in, [](vfloat a, int64_t, int) { return decoded(a); });
+  for_groups(in, [](vfloat a, int64_t, int) { return decode_curve(a).value; });
 }
 void srgb_encode(const SrgbNumbers& in) {
-  for_groups(in, [](vfloat a, int64_t, int) { return encoded(a); });
+  for_groups(in, [](vfloat a, int64_t, int) { return encode_curve(a).value; });
 }
 void srgb_decode_backward(const SrgbNumbers& in, const float* upstream) {
-  for_groups(in, [=](vfloat a, int64_t first, int lanes) { return load_first(upstream + first, lanes) * decode_slope(a); });
+  for_groups(in, [=](vfloat a, int64_t first, int lanes) {
+    return load_first(upstream + first, lanes) * decode_curve(a).slope;
+  });
 }
 void srgb_encode_backward(const SrgbNumbers& in, const float* upstream) {
-  for_groups(in, [=](vfloat a, int64_t first, int lanes) { return load_first(upstream + first, lanes) * encode_slope(a); });
+  for_groups(in, [=](vfloat a, int64_t first, int lanes) {
+    return load_first(upstream + first, lanes) * encode_curve(a).slope;
+  });
 }
 
 }  // namespace rtgs::RTGS_ISA

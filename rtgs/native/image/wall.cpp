@@ -9,10 +9,7 @@
 namespace rtgs::RTGS_ISA {
 namespace {
 
-constexpr int64_t kWorthThreads = 16384;  // numbers
 constexpr float kSmallestCosine = 1e-4f;
-
-inline int worth(int threads, int64_t numbers) { return numbers > kWorthThreads ? threads : 1; }
 
 // work(first, lanes, totals) for every group of rows; Sums totals of each block go to `sums` (blocks, Sums).
 template <int Sums, class Work>
@@ -107,7 +104,7 @@ void wall_leg(const WallLeg& in, float* arriving) {
   each_block(worth(in.threads, 3 * in.count), in.count, kLanes, [&](int64_t first) {
     const int lanes = lanes_at(first, in.count);
     Vector out = Leg(in, first, lanes).mixed;
-    for (int k = 0; k < 3; ++k) out.v[k] = decoded(out.v[k]);
+    for (int k = 0; k < 3; ++k) out.v[k] = decode_curve(out.v[k]).value;
     store_vectors(arriving, first, lanes, out);
   });
 }
@@ -121,7 +118,7 @@ void wall_leg_backward(const WallLeg& in, const float* upstream, const WallLegGr
     vfloat to_left{}, to_reflected{};
     for (int k = 0; k < 3; ++k) {
       const float tint = in.glass.tinted ? in.glass.tint[k] : 1.f;
-      to_contents.v[k] = given.v[k] * decode_slope(leg.mixed.v[k]);
+      to_contents.v[k] = given.v[k] * decode_curve(leg.mixed.v[k]).slope;
       to_left += to_contents.v[k] * leg.shown[k].value;
       const vfloat to_light = to_contents.v[k] * leg.left * leg.shown[k].slope;
       to_surroundings.v[k] = to_light * leg.passing.v[k] * leg.own[k].slope;
