@@ -40,7 +40,7 @@ def training(method: str, until: int, seed: int = 0) -> Step:
 
 def test_a_training_goes_by_its_steps_and_its_method(tmp_path):
     store = Store(tmp_path)
-    assert Expectation(store).seconds(training("2dgs", 2000)) == pytest.approx(60)  # the table: 0.03 s a step
+    assert Expectation(store).seconds(training("2dgs", 2000)) == pytest.approx(30)  # the table: 0.015 s a step
     recorded(store, training("2dgs", 100), 10.0)
     recorded(store, training("2dgs", 100, seed=1), 30.0)
     recorded(store, training("3dgs", 50), 50.0)
@@ -84,17 +84,17 @@ def test_only_trainings_tell_how_fast_the_machine_is(tmp_path):
     masks, long = Step("masks", 1, ToyParams(1.0), train), training("2dgs", 1000)
     clock = PlanClock(make_plan([masks, long], store), Expectation(store), now=lambda: 0.0)
     clock.finish(masks.fingerprint, 1.0)
-    assert clock.left() == pytest.approx(30)
+    assert clock.left() == pytest.approx(15)
 
 
 def test_workers_share_the_work_while_there_is_enough(tmp_path):
     store = Store(tmp_path)
     steps = [training("2dgs", 1000, seed) for seed in range(4)]
     clock = PlanClock(make_plan(steps, store), Expectation(store), lanes=3, now=lambda: 0.0)
-    assert clock.left() == pytest.approx(4 * 30 / 3)
+    assert clock.left() == pytest.approx(4 * 15 / 3)
     for step in steps[:3]:
         clock.finish(step.fingerprint, None)
-    assert clock.left() == pytest.approx(30)
+    assert clock.left() == pytest.approx(15)
 
 
 def test_lines_tell_what_is_left(tmp_path, caplog):
