@@ -359,7 +359,7 @@ class MethodSettings:
                 f"{moves}, but method.transmittance.normal={glass.normal} shows none of it: set it to mesh, or the "
                 "rate to 0"
             )
-        if glass.rim_samples > 0:
+        if glass.rim_samples > 0 and glass.wall.light == "fresnel":  # learned weights read none
             raise RtgsError(
                 f"{moves}, but method.transmittance.rim_samples={glass.rim_samples} takes samples of a mesh that "
                 "stays: set one of them to 0"

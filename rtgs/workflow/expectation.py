@@ -24,7 +24,8 @@ SECONDS = {
     "extract_mesh": 10.0,
 }
 SECONDS |= {"judge": 4.0, "render": 4.0, "evaluate": 4.0, "report": 3.0}
-"""What a step takes on two cores with photos of 256x192, where none of its kind was ever run here."""
+"""What a step takes on two cores with photos of 256x192, where none of its kind was ever run here. Larger ones take
+longer."""
 OTHER_SECONDS = 10.0
 TRAINING_STEP_SECONDS = {"plain": 0.015, "train_diffuse": 0.015, "train_reflection": 0.06, "train_shading": 0.06}
 TRAINING_STEP_SECONDS |= {"train_transmittance": 0.1}

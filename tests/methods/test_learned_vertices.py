@@ -18,7 +18,7 @@ from rtgs.methods import Mode
 from rtgs.methods.model import Model
 from rtgs.methods.parts.glass import Glass
 from rtgs.methods.parts.vertices import LearnedVertices
-from rtgs.methods.settings import MethodSettings, VertexSettings
+from rtgs.methods.settings import MethodSettings, VertexSettings, WallSettings
 from rtgs.train.trainer import Trainer
 
 STEP = 40
@@ -192,6 +192,8 @@ def test_walls_that_scatter_and_samples_of_a_mesh_that_stays_are_refused():
     base = learning()
     with pytest.raises(RtgsError, match=r"vertices\.rate=0\.1 moves .*rim_samples=16 .*set one of them to 0"):
         replace(base, transmittance=replace(base.transmittance, rim_samples=16))
+    learned = replace(base.transmittance, rim_samples=16, wall=WallSettings())
+    assert replace(base, transmittance=learned).transmittance.rim_samples == 16  # which learned weights do not read
     still = replace(LEARNED, rate=0.0)
     base = learning(still, roughness=0.05)
     assert replace(base, transmittance=replace(base.transmittance, rim_samples=16)).transmittance.vertices == still

@@ -140,6 +140,21 @@ def test_only_pixels_at_the_outline_change_and_layers_add_up(made: GlassScene):
     assert float(light["beside"].flatten(1)[:, other].abs().max()) == 0
 
 
+def test_pixels_outside_the_mask_keep_what_covers_them(made: GlassScene, monkeypatch: pytest.MonkeyPatch):
+    method, camera, asked = begun(sampled(), made), made.scene.train[0].camera, []
+    wall = method.parts["glass"].wall  # type: ignore[attr-defined]
+    on_glass = wall.on_glass
+    monkeypatch.setattr(wall, "on_glass", lambda glass, of: asked.append(glass) or on_glass(glass, of))
+    with torch.no_grad():
+        picture(method, made)
+        glass = asked[0]
+        whole = (glass.flat.specular / method.settings.transmittance.wall.cover).clamp_max(1)
+        plain = torch.where(glass.known, whole, glass.flat.specular)
+        assert not torch.equal(on_glass(glass, camera).flat.specular, plain)
+        hidden = replace(glass, inside=torch.zeros_like(glass.inside))
+        torch.testing.assert_close(on_glass(hidden, camera).flat.specular, plain, rtol=0, atol=0)
+
+
 def test_training_reaches_what_is_seen_beside_the_object_and_goes_on_bit_for_bit(made: GlassScene):
     whole = begun(sampled(index_rate=0.01), made)
     rendered = picture(whole, made, Mode.TRAIN)

@@ -206,8 +206,10 @@ class WallLight:
         specular = (glass.flat.specular / self.settings.cover).clamp_max(1)
         if self._coverage is not None:
             found = self._coverage.coverage(camera)
-            own = covering(glass.flat.specular[found.pixels], found.share, self.settings.cover)
-            specular = specular.index_copy(0, found.pixels, own)
+            shown = (glass.known & glass.inside)[found.pixels]  # as outline() has it: elsewhere nothing shows the rest
+            pixels, share = found.pixels[shown], found.share[shown]
+            own = covering(glass.flat.specular[pixels], share, self.settings.cover)
+            specular = specular.index_copy(0, pixels, own)
         specular = torch.where(glass.known, specular, glass.flat.specular)
         return replace(glass, flat=replace(glass.flat, specular=specular))
 
