@@ -60,7 +60,8 @@ def measure(run: Path) -> list[Row]:
     method, _ = load_method(artifact(run, "train_transmittance"), scene)
     glass = method.parts["glass"]
     if not isinstance(glass, Glass) or glass.vertices is None or glass.guide is None:
-        raise RtgsError(f"{run} learned no vertices: run with method.transmittance.vertices.rate=0.03 rim_samples=0")
+        words = "method.transmittance.vertices.rate=0.03 method.transmittance.rim_samples=0"
+        raise RtgsError(f"{run} learned no vertices: run with {words}")
     said = "; ".join(decision.why for decision in glass.vertices.decisions)
     meshes = (("found", glass.vertices.found, ""), ("learned", glass.guide.mesh, said))
     return [Row(run.name, scene.name, name, _score(mesh, scene), text) for name, mesh, text in meshes]
