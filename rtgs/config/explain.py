@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 import difflib
 import re
-import typing
+from collections.abc import Collection
 
 from hydra.errors import OverrideParseException
 
-from rtgs.config.keys import config_keys
+from rtgs.config.keys import config_keys, keys_of
 from rtgs.config.locate import choices_of
 from rtgs.config.synthesize import SynthesizeConfig
 
@@ -29,22 +28,26 @@ def explain(error: BaseException) -> str:
     text = re.sub(r"\n\s*full_key: ?", "", text)
     if match := re.search(r"Could not find '(\w+)/([^']*)'", text):
         text += _advice_for_choice(*match.groups())
-    match = re.search(r"Key '([^']+)' (?:is )?not in", text)
+    match = re.search(r"Key '([^']+)' (?:is )?not in(?: '(\w+)')?", text)
     if match:
-        close = close_keys(match.group(1))
-        text += f"\nDid you mean {' or '.join(close)}?" if close else "\n`rtgs explain` lists all keys."
+        known = keys_of(SynthesizeConfig()) if match[2] == SynthesizeConfig.__name__ else None
+        close = close_keys(match[1], known)
+        listed = "`rtgs explain` lists all keys." if known is None else "`rtgs run synthesize --help` lists its keys."
+        text += f"\nDid you mean {' or '.join(close)}?" if close else f"\n{listed}"
     return text
 
 
-def close_keys(name: str) -> list[str]:
-    """Keys and groups of keys that somebody may mean who writes ``name``, the likeliest first, three at most."""
-    if name in _ELSEWHERE:
-        return [_ELSEWHERE[name]]
-    places = [
-        *config_keys(),
-        *{key.rpartition(".")[0] for key in config_keys() if "." in key},
-        *all_keys(SynthesizeConfig),
-    ]
+def close_keys(name: str, known: Collection[str] | None = None) -> list[str]:
+    """Keys and groups of keys that somebody may mean who writes ``name``, the likeliest first, three at most.
+
+    Args:
+        known: dotted keys of the command in question. None: those of a run.
+    """
+    elsewhere = _ELSEWHERE.get(name)
+    if elsewhere and (known is None or elsewhere in known):
+        return [elsewhere]
+    keys = config_keys() if known is None else known
+    places = [*keys, *{key.rpartition(".")[0] for key in keys if "." in key}]
     last = {}
     for place in sorted(set(places), key=lambda place: (place.count("."), place)):
         last.setdefault(place.rpartition(".")[2], []).append(place)
@@ -78,13 +81,3 @@ def _advice_for_choice(group: str, name: str) -> str:
     close = difflib.get_close_matches(name, choices_of(group), n=3)
     advice = f"\nDid you mean {' or '.join(close)}?" if close else ""
     return advice + ("\nA folder works as well: scene=/path/to/capture" if group == "scene" else "")
-
-
-def all_keys(cls: type) -> set[str]:
-    """Every field name in a dataclass tree."""
-    names: set[str] = set()
-    for name, hint in typing.get_type_hints(cls).items():
-        names.add(name)
-        if dataclasses.is_dataclass(hint):
-            names |= all_keys(typing.cast(type, hint))
-    return names

@@ -30,7 +30,12 @@ class Key:
 @cache
 def config_keys() -> dict[str, Key]:
     """Every key by its dotted name, in the order of the dataclasses."""
-    return dict(_keys_of(RunConfig(), ""))
+    return keys_of(RunConfig())
+
+
+def keys_of(settings: Any) -> dict[str, Key]:
+    """Every key of an instance of a tree of dataclasses by its dotted name, in their order."""
+    return dict(_keys_of(settings, ""))
 
 
 def own_keys(settings: Any) -> dict[str, Key]:

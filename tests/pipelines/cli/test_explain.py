@@ -225,6 +225,21 @@ def test_words_of_other_programs_and_slips_lead_to_the_key(word, key):
     assert close_keys(word)[0] == key
 
 
+@pytest.mark.parametrize(
+    ("word", "expected"),
+    [
+        ("threads=1", "`rtgs run synthesize --help` lists its keys"),
+        ("samplez=1", "Did you mean samples or test_samples?"),
+        ("points=1", "Did you mean features.points?"),
+        ("output_dir=x", "Did you mean paths.root?"),
+        ("iterations=1", "`rtgs run synthesize --help` lists its keys"),
+    ],
+)
+def test_synthesize_advises_its_own_keys_alone(word, expected, capsys):
+    assert main(["run", "synthesize", "scene=ball_statue", word]) == 1
+    assert expected in capsys.readouterr().err
+
+
 def test_every_key_that_is_advised_exists():
     from rtgs.config.explain import _ELSEWHERE
 
