@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import platform
 import sys
 
 import numpy as np
@@ -19,3 +20,14 @@ def test_the_peak_is_that_of_the_stretch_and_not_of_the_process():
     again = np.ones(20_000_000)
     assert peak_memory_mb() > 150
     assert again.sum() == 20_000_000
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc hands back what lies below a used block")
+def test_what_earlier_work_has_freed_is_handed_back_first():
+    blocks = [np.ones(8_000) for _ in range(4_000)]  # 256 MB in blocks too small for mappings of their own
+    last = blocks.pop()  # the heap cannot shrink from its end
+    high = peak_memory_mb()
+    blocks.clear()
+    start_peak_memory()
+    assert peak_memory_mb() < high - 200
+    assert last.sum() == 8_000
