@@ -50,8 +50,9 @@ def _pairs(inputs: Mapping[str, Path], scene: Scene, regions: Regions) -> Iterat
     full, stage = load_method(last_training(inputs), scene)
     plain, plain_stage = load_method(inputs[PLAIN], scene)
     for view in scene.held:
-        images = [evaluated(*each, view.camera) for each in ((full, stage.until), (plain, plain_stage.until))]
+        both = ((full, stage.until), (plain, plain_stage.until))
+        images = [evaluated(*each, view.camera, view.mask) for each in both]  # as the test views are shown
         yield Pair(regions.numbers(view.camera), view.image, *images)
 
 
-STEP = StepKind(JUDGE, 1, judge)
+STEP = StepKind(JUDGE, 2, judge)

@@ -17,7 +17,8 @@ from rtgs.core.errors import RtgsError
 from rtgs.core.records import damaged
 from rtgs.mesh.guide import MeshGuide
 from rtgs.mesh.normals import corner_normals, interpolated, neighbourhood_normals
-from rtgs.mesh.record import RECORD_FILE, MeshRecord
+from rtgs.mesh.pieces import piece_labels, submesh
+from rtgs.mesh.record import AND, CARVED, RECORD_FILE, MeshRecord
 from rtgs.mesh.triangles import TriangleMesh, read_mesh_ply, write_mesh_ply
 
 MESH_FILE = "mesh.ply"
@@ -27,7 +28,7 @@ BOX_MARGIN = 0.05  # of the object box, on each side (method.md 6.2)
 _BOX_POINTS = 0.005  # share of the points behind a pane that its box leaves out at either end of each axis
 _NORMAL_ROUNDS = 2  # of smoothing; measured in docs/lab/mesh.md
 _PLANES_CREASE = 5.0  # degrees between faces of a body of planes that are two planes
-_NORMAL_REACH = {"": 5.0, "free": 2.0}  # voxels: of a mesh as it was found, of a smoothed one; not in it: none
+_NORMAL_REACH = {"": 5.0, CARVED: 5.0, "free": 2.0}  # voxels: of a mesh as found, of a smoothed one; else none
 _BATCH = 65536  # points whose rays are cast at once
 
 
@@ -39,7 +40,7 @@ class ObjectMesh:
     source: str  # "hull", "tsdf" or "given"
     voxel: float  # world units: of the grid it was found on; walls nearer than 2 voxels are one
     flat: bool  # a pane: one wall, no interior; what is transmitted lies behind it
-    surface: str = ""  # how a hull was smoothed: "free", "sphere", ...; empty: it is as it was carved
+    surface: str = ""  # how a hull was smoothed: "free", "sphere", ..., of several objects "sphere+free"; empty: not
     turned: np.ndarray | None = None  # (F, 3, 3) float32 unit normals of the corners; None: those of the triangles
 
     def __post_init__(self) -> None:
@@ -60,11 +61,24 @@ class ObjectMesh:
         """(F, 3, 3) float32 smoothed unit normals of the faces' corners; of a given mesh only a little."""
         if self.turned is not None:
             return self.turned
-        if self.surface == "planes":
-            return corner_normals(self.mesh, 0, _PLANES_CREASE)
-        corners = corner_normals(self.mesh, _NORMAL_ROUNDS)
-        reach = 0.0 if self.source == "given" or self.flat else _NORMAL_REACH.get(self.surface, 0.0)
-        return neighbourhood_normals(self.mesh, corners, reach * self.voxel) if reach else corners
+        kinds = self.surface.split(AND)
+        if len(kinds) == 1:
+            return self._corners(self.mesh, self.surface)
+        label = piece_labels(self.mesh)
+        if label.max() + 1 != len(kinds):
+            raise RtgsError(f"the object mesh has {label.max() + 1} connected pieces, its surfaces are {self.surface}")
+        corners = np.empty((len(label), 3, 3), np.float32)
+        for number, kind in enumerate(kinds):
+            corners[label == number] = self._corners(submesh(self.mesh, label == number), kind)
+        return corners
+
+    def _corners(self, mesh: TriangleMesh, surface: str) -> np.ndarray:
+        """Of one object."""
+        if surface == "planes":
+            return corner_normals(mesh, 0, _PLANES_CREASE)
+        corners = corner_normals(mesh, _NORMAL_ROUNDS)
+        reach = 0.0 if self.source == "given" or self.flat else _NORMAL_REACH.get(surface, 0.0)
+        return neighbourhood_normals(mesh, corners, reach * self.voxel) if reach else corners
 
     @cached_property
     def rays(self) -> MeshGuide:

@@ -10,6 +10,10 @@ from rtgs.core.decisions import Decision
 from rtgs.core.records import damaged, read_json, record_of, write_json
 
 RECORD_FILE = "mesh.json"
+AND = "+"
+"""Between the kinds of several objects' surfaces, in the order of their faces."""
+CARVED = "carved"
+"""Kind of an object, of several, whose surface is as its hull was carved."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +45,8 @@ class SurfaceFit:
         iou_before, iou: silhouette IoU of the hull and of the surface with the masks, where nothing hides the object.
         outline_before, outline: pixels between their outlines and those of the masks, root mean square; None:
             the surface has no rim near an outline.
-        contradicted: share of the surface's seen area where the outlines are off by more than their noise.
+        contradicted: share of the surface's seen area where the outlines are off by more than their noise; of several
+            objects that of the worst, and nothing of what follows.
         strength: of smoothing: voxels, median over the vertices.
         sharp: of a free surface: share of the vertices at which the outlines asked for less smoothing: edges.
         unseen: share of the vertices that no outline tells of.
@@ -81,7 +86,8 @@ class MeshRecord:
         source: how the object's mesh was found: ``hull``, ``tsdf``, ``given``; None: a mesh of the scene.
         voxel: side of the grid's cells, world units.
         flat: the object is a pane.
-        surface: how the hull was smoothed: ``free``, ``sphere``, ``revolution``, ``planes``; None: it was not.
+        surface: how the hull was smoothed: ``free``, ``sphere``, ``revolution``, ``planes``; of several objects these
+            in the order of the faces, joined by ``+``, also ``carved``; None: it was not.
         surface_fit: figures of that.
     """
 

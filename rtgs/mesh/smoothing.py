@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from rtgs.mesh.pieces import piece_labels, submesh
 from rtgs.mesh.triangles import TriangleMesh
 
 _TAUBIN = (0.5, -0.53)  # weights of the shrinking and of the growing step (Taubin 1995: pass band 0.1)
@@ -66,20 +67,9 @@ def main_pieces(mesh: TriangleMesh, min_share: float) -> tuple[TriangleMesh, int
     Returns:
         Mesh, pieces before, pieces kept.
     """
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
     if len(mesh.faces) == 0:
         return mesh, 0, 0
-    count = len(mesh.vertices)
-    edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]]])
-    graph = coo_matrix((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(count, count))
-    _, labels = connected_components(graph, directed=False)
-    piece = labels[mesh.faces[:, 0]]
-    volumes = np.bincount(piece, weights=_face_volumes(mesh), minlength=labels.max() + 1)
+    piece = piece_labels(mesh)
+    volumes = np.bincount(piece, weights=_face_volumes(mesh))
     keep = volumes >= max(min_share * volumes.max(), 1e-300)
-    faces = mesh.faces[keep[piece]]
-    used, renumbered = np.unique(faces, return_inverse=True)
-    colors = None if mesh.colors is None else mesh.colors[used]
-    kept = TriangleMesh(mesh.vertices[used], renumbered.reshape(-1, 3), colors)
-    return kept, len(np.unique(piece)), int(keep[np.unique(piece)].sum())
+    return submesh(mesh, keep[piece]), len(volumes), int(keep.sum())

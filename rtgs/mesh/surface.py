@@ -1,26 +1,32 @@
 """The surface that light is traced with: what explains the masks' outlines most simply.
 
 A sphere, a surface of revolution, a body of planes, or the hull made as smooth as the outlines allow: the first that
-they do not contradict.
+they do not contradict. Of several objects each has its own.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from rtgs.core.decisions import Decision
 from rtgs.mesh.ball import fit_ball
 from rtgs.mesh.fairing import contradicted_share, fair_surface
+from rtgs.mesh.guide import MeshGuide
 from rtgs.mesh.hull import HullResult
 from rtgs.mesh.operators import MeshShape
+from rtgs.mesh.pieces import joined, pieces
 from rtgs.mesh.polyhedron import fit_planes
-from rtgs.mesh.record import SurfaceFit
+from rtgs.mesh.record import AND, CARVED, SurfaceFit
 from rtgs.mesh.revolution import fit_revolution
 from rtgs.mesh.rims import RimView, find_rims, rim_views
 from rtgs.mesh.settings import SurfaceSettings
-from rtgs.mesh.silhouettes import MaskSet, SilhouetteScore
+from rtgs.mesh.silhouettes import MaskSet, SilhouetteScore, silhouette
 from rtgs.mesh.triangles import TriangleMesh
+
+_OWN, _OTHERS = 5, 4  # pixels around an object's silhouette: within the one an outline may be its own
 
 Score = Callable[[TriangleMesh], SilhouetteScore]
 """Silhouette IoU of a mesh with the masks."""
@@ -31,8 +37,10 @@ class Surface:
     """What became of the hull."""
 
     mesh: TriangleMesh
-    kind: str  # "sphere", "revolution", "planes", "free", or empty: the hull stays
-    fit: SurfaceFit  # where the hull stays: of the last surface that was refused
+    kind: (
+        str  # "sphere", "revolution", "planes", "free", or empty: the hull stays; of several objects joined by ``AND``
+    )
+    fit: SurfaceFit  # where the hull stays: of the last surface that was refused; of several objects: of all together
     decision: Decision
 
 
@@ -51,17 +59,27 @@ class _Candidate:
 
 def find_surface(hull: HullResult, masks: MaskSet, settings: SurfaceSettings, score: Score) -> Surface:
     """The simplest surface that the masks' outlines do not contradict; the hull itself where none costs little enough
-    silhouette IoU."""
+    silhouette IoU. Each connected piece of the hull is an object with a surface of its own."""
     views = rim_views(masks.views, hull.hidden)
-    before = find_rims(MeshShape.of(hull.mesh), views).spread
-    carved = score(hull.mesh).mean
+    objects = pieces(hull.mesh)
+    if len(objects) == 1:
+        return _surface_of(hull.mesh, hull.voxel, views, settings, score)
+    return _surfaces_of(objects, hull, views, settings, score)
+
+
+def _surface_of(
+    hull: TriangleMesh, voxel: float, views: list[RimView], settings: SurfaceSettings, score: Score
+) -> Surface:
+    """Of one object."""
+    before = find_rims(MeshShape.of(hull), views).spread
+    carved = score(hull).mean
     fit, refused = None, []
-    for found in _candidates(hull, views, settings):
+    for found in _candidates(hull, voxel, views, settings):
         shape = MeshShape.of(found.mesh)
         rims = find_rims(shape, views)
         share = found.contradicted
         if share is None:
-            share = contradicted_share(shape, rims, hull.voxel, settings.tolerance)
+            share = contradicted_share(shape, rims, voxel, settings.tolerance)
         cost = settings.iou_cost if found.kind != "planes" else 0.0  # edges alone tell too little of what lies between
         iou = score(found.mesh).mean
         known = (found.strength, found.sharp, found.unseen, found.feet, found.held)
@@ -76,26 +94,69 @@ def find_surface(hull: HullResult, masks: MaskSet, settings: SurfaceSettings, sc
             why = "; ".join([f"{found.said}; {_figures(fit)}", *(f"not {text}" for text in refused)])
             return Surface(found.mesh, found.kind, fit, Decision(f"hull smoothed: {found.kind}", why))
     assert fit is not None  # a free surface is always tried
-    return Surface(hull.mesh, "", fit, Decision("hull not smoothed", "; ".join(refused)))
+    return Surface(hull, "", fit, Decision("hull not smoothed", "; ".join(refused)))
 
 
-def _candidates(hull: HullResult, views: list[RimView], settings: SurfaceSettings) -> Iterator[_Candidate]:
+def _surfaces_of(
+    objects: Sequence[TriangleMesh], hull: HullResult, views: list[RimView], settings: SurfaceSettings, score: Score
+) -> Surface:
+    """Of several objects, one after the other, beside what the others have become."""
+    meshes, kinds, said, worst = list(objects), [], [], 0.0
+    for number, (mesh, own) in enumerate(zip(objects, _own_views(objects, views), strict=True)):
+
+        def together(each: TriangleMesh, number: int = number) -> SilhouetteScore:
+            return score(joined([*meshes[:number], each, *meshes[number + 1 :]]))
+
+        found = _surface_of(mesh, hull.voxel, own, settings, together)
+        meshes[number] = found.mesh
+        kinds.append(found.kind or CARVED)
+        said.append(f"object {number + 1}, {kinds[-1]}: {found.decision.why}")
+        worst = max(worst, found.fit.contradicted if found.kind else 0.0)
+    if set(kinds) == {CARVED}:
+        return Surface(hull.mesh, "", found.fit, Decision("hull not smoothed", "; ".join(said)))
+    whole = joined(meshes)
+    before, after = (find_rims(MeshShape.of(mesh), views).spread for mesh in (hull.mesh, whole))
+    fit = SurfaceFit(score(hull.mesh).mean, score(whole).mean, before, after, worst)
+    kind = AND.join(kinds)
+    return Surface(whole, kind, fit, Decision(f"hull smoothed: {kind}", "; ".join([*said, _figures(fit)])))
+
+
+def _own_views(objects: Sequence[TriangleMesh], views: Sequence[RimView]) -> list[list[RimView]]:
+    """For each object the views with those outlines alone that can be its own: near its silhouette, and not near
+    another one's."""
+    from scipy.ndimage import binary_dilation
+
+    guides = [MeshGuide(mesh, 0.0) for mesh in objects]
+    own: list[list[RimView]] = [[] for _ in objects]
+    for view in views:
+        seen = [silhouette(guide, view.camera) for guide in guides]
+        for number, views_of_it in enumerate(own):
+            near = binary_dilation(seen[number], iterations=_OWN)
+            for other in [*seen[:number], *seen[number + 1 :]]:
+                near &= np.logical_not(binary_dilation(other, iterations=_OTHERS))
+            views_of_it.append(replace(view, usable=view.usable & near))
+    return own
+
+
+def _candidates(
+    hull: TriangleMesh, voxel: float, views: list[RimView], settings: SurfaceSettings
+) -> Iterator[_Candidate]:
     """What is tried, the simplest first."""
     if settings.fit == "auto":
-        ball = fit_ball(hull.mesh, views)
+        ball = fit_ball(hull, views)
         if ball is not None:
             yield _Candidate(ball.mesh(), "sphere", f"a sphere of radius {ball.radius:.4g}")
-        turned = fit_revolution(hull.mesh, hull.voxel, views, settings.foot_degrees)
+        turned = fit_revolution(hull, voxel, views, settings.foot_degrees)
         if turned is not None:
             said = f"a surface of revolution, its profile smoothed over {turned.length:g} voxels"
             said += "" if turned.straight == 0 else f", straight between edges in {turned.straight} places"
             unseen = 1 - float(turned.seen.mean())
             yield _Candidate(turned.mesh(), "revolution", said, strength=turned.length, unseen=unseen)
-        flat = fit_planes(hull.mesh, hull.voxel, views, settings.tolerance)
+        flat = fit_planes(hull, voxel, views, settings.tolerance)
         if flat is not None:
             said = f"a body of {len(flat.body.normals)} planes"
-            yield _Candidate(flat.body.mesh(hull.voxel), "planes", said, flat.contradicted)
-    free = fair_surface(hull.mesh, hull.voxel, views, settings)
+            yield _Candidate(flat.body.mesh(voxel), "planes", said, flat.contradicted)
+    free = fair_surface(hull, voxel, views, settings)
     said = f"smoothed over {free.strength:.1f} voxels, less at {100 * free.sharp:.0f} % of the vertices, where the "
     said += f"outlines contradict; no outline tells of {100 * free.unseen:.1f} %"
     parts = [(free.feet, "made plane"), (free.held, "held where the hull is")]

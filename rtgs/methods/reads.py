@@ -55,6 +55,10 @@ def with_cubemap(settings: MethodSettings) -> MethodSettings:
     return replace(plain, environment=settings.environment)
 
 
+_BOUND = TransmittanceSettings()
+"""The bound of learned weights where nothing reads it."""
+
+
 def as_lit(settings: MethodSettings) -> MethodSettings:
     """Of the environment only where rays see it; nothing of the walls where their weights are learned, nothing of the
     bound of learned weights where there is none."""
@@ -62,6 +66,8 @@ def as_lit(settings: MethodSettings) -> MethodSettings:
     learned = transmittance.wall.light == "learned"
     if learned:
         transmittance = replace(transmittance, wall=WallSettings(), rim_samples=0)
+    else:
+        transmittance = replace(transmittance, max_gain=_BOUND.max_gain, max_weight=_BOUND.max_weight)
     if not (learned and transmittance.interface.count > 0 and transmittance.max_weight > 0):
         transmittance = replace(transmittance, weight_bound="clamp")
     return replace(settings, transmittance=transmittance, environment=_far(settings))

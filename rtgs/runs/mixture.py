@@ -31,14 +31,14 @@ def regions_of(inputs: Mapping[str, Path]) -> Regions:
     return Regions(read_object_mesh(folder) if folder.is_dir() else None)
 
 
-def evaluated(method: Model, step: int, camera: Camera) -> Tensor:
-    """(3, H, W) as a test view without a mask is rendered."""
+def evaluated(method: Model, step: int, camera: Camera, mask: Tensor | None = None) -> Tensor:
+    """(3, H, W) as a test view with this mask (H, W) bool is rendered."""
     import torch
 
     from rtgs.methods import Mode
 
     with torch.no_grad():
-        return method.render(camera, step, Mode.EVALUATE).image
+        return method.render(camera, step, Mode.EVALUATE, mask=mask).image
 
 
 @dataclass(frozen=True)

@@ -108,6 +108,14 @@ def test_the_bound_is_in_a_recipe_only_where_weights_are_learned_and_bounded():
         assert as_lit(settings).transmittance.weight_bound == "clamp"
 
 
+def test_what_bounds_learned_weights_is_in_no_recipe_where_none_are():
+    bounds = ["method.transmittance.max_gain=2.0", "method.transmittance.max_weight=0.5"]
+    for light, read in (("fresnel", False), ("learned", True)):
+        words = ["scene=ball_statue", "method=rtgs", f"method.transmittance.wall.light={light}"]
+        plain, bounded = (as_lit(compose([*words, *more])[0].method) for more in ([], bounds))
+        assert (plain != bounded) == read
+
+
 def test_masks_as_trained_show_through_where_the_mesh_is_missed(made: GlassScene):
     """``given`` leaves a masked pixel dark whose ray misses the mesh; the paper knows no such rule."""
     other = replace(made, mesh=smaller(made.mesh))

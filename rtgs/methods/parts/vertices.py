@@ -23,6 +23,7 @@ from rtgs.mesh.container import ObjectGuide, ObjectMesh, ObjectSurfaces, camera_
 from rtgs.mesh.displacement import Displacement, SparseMap
 from rtgs.mesh.meetings import Meetings, meetings
 from rtgs.mesh.outlines import plain_outlines, refined_outlines
+from rtgs.mesh.record import AND
 from rtgs.mesh.rims import RimView, find_rims, rim_views
 from rtgs.mesh.silhouettes import MaskView, mask_set
 from rtgs.methods.settings import VertexSettings
@@ -43,7 +44,8 @@ def why_not(mesh: ObjectMesh) -> str:
     """Why the vertices of this mesh are not learned; empty: they are."""
     if mesh.flat:
         return "the object is a pane"
-    return f"the object's surface is made of {mesh.surface}" if mesh.surface in EXACT else ""
+    exact = [kind for kind in mesh.surface.split(AND) if kind in EXACT]
+    return f"the object's surface is made of {exact[0]}" if exact else ""
 
 
 def hidden_pixels(mesh: ObjectMesh, views: Sequence[View], depths: Callable[[Camera], Tensor]) -> Tensor:

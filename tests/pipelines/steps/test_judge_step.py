@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ import torch
 from PIL import Image
 
 from pipelines.cli.main import main
+from pipelines.steps import judge
 from rtgs.config.names import overridden
 from rtgs.core.cameras import Camera
 from rtgs.core.names import plain_stem
@@ -104,6 +106,22 @@ def test_the_judge_measures_what_neither_method_was_trained_on(glass):
         gains.append(psnr(full, view.image, mask=inside) - psnr(plain, view.image, mask=inside))
     assert record.regions[1].gain == pytest.approx(sum(gains) / len(gains))
     assert sum(gains) < 0
+
+
+def test_both_methods_are_judged_with_the_masks_that_pictures_are_rendered_with(glass, monkeypatch):
+    places = folders(glass[0])
+    scene, masks = read_scene(places["import_scene"]), []
+    _, stage = load_method(places["train_transmittance"], scene)
+
+    def rendered(camera: Camera, *_: object, mask: torch.Tensor) -> SimpleNamespace:
+        masks.append(mask)
+        return SimpleNamespace(image=torch.zeros(3, camera.height, camera.width))
+
+    monkeypatch.setattr(judge, "load_method", lambda *_: (SimpleNamespace(render=rendered), stage))
+    regions = Regions(read_object_mesh(places["train_transmittance"] / OBJECT_FOLDER))
+    assert len(list(judge._pairs(places, scene, regions))) == len(scene.held) > 0
+    shown = [view.mask for view in scene.held for _ in range(2)]
+    assert all(mask is not None and torch.equal(mask, other) for mask, other in zip(masks, shown, strict=True))
 
 
 def test_a_judged_run_says_what_it_shows(glass, capsys, monkeypatch):
