@@ -10,7 +10,7 @@ from hydra.errors import OverrideParseException
 
 from rtgs.config.keys import config_keys, keys_of
 from rtgs.config.locate import choices_of
-from rtgs.config.synthesize import SynthesizeConfig
+from rtgs.config.synthesize import SYNTHESIZE_NOTE, SynthesizeConfig
 
 
 def explain(error: BaseException) -> str:
@@ -28,9 +28,10 @@ def explain(error: BaseException) -> str:
     text = re.sub(r"\n\s*full_key: ?", "", text)
     if match := re.search(r"Could not find '(\w+)/([^']*)'", text):
         text += _advice_for_choice(*match.groups())
-    match = re.search(r"Key '([^']+)' (?:is )?not in(?: '(\w+)')?", text)
+    match = re.search(r"Key '([^']+)' (?:is )?not in", text)
     if match:
-        known = keys_of(SynthesizeConfig()) if match[2] == SynthesizeConfig.__name__ else None
+        of_synthesize = SYNTHESIZE_NOTE in getattr(error, "__notes__", ())
+        known = keys_of(SynthesizeConfig()) if of_synthesize else None
         close = close_keys(match[1], known)
         listed = "`rtgs explain` lists all keys." if known is None else "`rtgs run synthesize --help` lists its keys."
         text += f"\nDid you mean {' or '.join(close)}?" if close else f"\n{listed}"

@@ -12,6 +12,8 @@ from rtgs.core.build import build
 from rtgs.scenes.synthetic.settings import CaptureSettings
 
 SCHEMA_NAME = "synthesize_schema"
+SYNTHESIZE_NOTE = "in `rtgs run synthesize`"
+"""On an error of its words: which command's keys may be meant."""
 
 
 @dataclass(frozen=True)
@@ -40,11 +42,16 @@ def compose_synthesize(overrides: Sequence[str]) -> SynthesizeConfig:
     """
     from hydra import compose
     from hydra.core.config_store import ConfigStore
+    from hydra.errors import HydraException
     from omegaconf import OmegaConf
 
     ConfigStore.instance().store(name=SCHEMA_NAME, node=open_schema(SynthesizeConfig), provider="rtgs")
     with opened_configs():
-        composed = compose("synthesize", overrides=list(overrides))
+        try:
+            composed = compose("synthesize", overrides=list(overrides))
+        except HydraException as error:
+            error.add_note(SYNTHESIZE_NOTE)
+            raise
     values = OmegaConf.to_container(without_hydra(composed), resolve=True, throw_on_missing=True)
     assert isinstance(values, dict)
     return build(SynthesizeConfig, {str(key): value for key, value in values.items()})

@@ -27,6 +27,7 @@ from rtgs.mesh.silhouettes import MaskSet, SilhouetteScore, silhouette
 from rtgs.mesh.triangles import TriangleMesh
 
 _OWN, _OTHERS = 5, 4  # pixels around an object's silhouette: within the one an outline may be its own
+_MOST_UNSEEN = 0.5  # share of the vertices of one of several objects
 
 Score = Callable[[TriangleMesh], SilhouetteScore]
 """Silhouette IoU of a mesh with the masks."""
@@ -59,22 +60,30 @@ class _Candidate:
 
 def find_surface(hull: HullResult, masks: MaskSet, settings: SurfaceSettings, score: Score) -> Surface:
     """The simplest surface that the masks' outlines do not contradict; the hull itself where none costs little enough
-    silhouette IoU. Each connected piece of the hull is an object with a surface of its own."""
+    silhouette IoU. Where no one form fits all of the hull, each connected piece is an object with a surface of its own.
+    """
     views = rim_views(masks.views, hull.hidden)
     objects = pieces(hull.mesh)
-    if len(objects) == 1:
-        return _surface_of(hull.mesh, hull.voxel, views, settings, score)
+    whole = _surface_of(hull.mesh, hull.voxel, views, views, settings, score)
+    if len(objects) == 1 or whole.kind not in ("free", ""):
+        return whole
     return _surfaces_of(objects, hull, views, settings, score)
 
 
 def _surface_of(
-    hull: TriangleMesh, voxel: float, views: list[RimView], settings: SurfaceSettings, score: Score
+    hull: TriangleMesh,
+    voxel: float,
+    views: list[RimView],
+    around: list[RimView],
+    settings: SurfaceSettings,
+    score: Score,
 ) -> Surface:
-    """Of one object."""
+    """Of one object. ``views`` have those outlines alone that can be its own; a free surface is never far from the hull
+    and takes what is near it of all outlines (``around``)."""
     before = find_rims(MeshShape.of(hull), views).spread
     carved = score(hull).mean
     fit, refused = None, []
-    for found in _candidates(hull, voxel, views, settings):
+    for found in _candidates(hull, voxel, views, around, settings):
         shape = MeshShape.of(found.mesh)
         rims = find_rims(shape, views)
         share = found.contradicted
@@ -100,20 +109,27 @@ def _surface_of(
 def _surfaces_of(
     objects: Sequence[TriangleMesh], hull: HullResult, views: list[RimView], settings: SurfaceSettings, score: Score
 ) -> Surface:
-    """Of several objects, one after the other, beside what the others have become."""
-    meshes, kinds, said, worst = list(objects), [], [], 0.0
+    """Of several objects, one after the other, beside what the others have become. They share what a surface may cost;
+    a free one most that no outline tells of is left as it is."""
+    meshes, kinds, said, worst, fit = list(objects), [], [], 0.0, None
+    each_settings = replace(settings, iou_cost=settings.iou_cost / len(objects))
     for number, (mesh, own) in enumerate(zip(objects, _own_views(objects, views), strict=True)):
 
         def together(each: TriangleMesh, number: int = number) -> SilhouetteScore:
             return score(joined([*meshes[:number], each, *meshes[number + 1 :]]))
 
-        found = _surface_of(mesh, hull.voxel, own, settings, together)
-        meshes[number] = found.mesh
-        kinds.append(found.kind or CARVED)
-        said.append(f"object {number + 1}, {kinds[-1]}: {found.decision.why}")
-        worst = max(worst, found.fit.contradicted if found.kind else 0.0)
+        found = _surface_of(mesh, hull.voxel, own, views, each_settings, together)
+        fit, kind, why = found.fit, found.kind or CARVED, found.decision.why
+        unseen = found.fit.unseen or 0.0
+        if kind == "free" and unseen > _MOST_UNSEEN:
+            kind, why = CARVED, f"no outline tells of {100 * unseen:.0f} %"
+        if kind != CARVED:
+            meshes[number], worst = found.mesh, max(worst, found.fit.contradicted)
+        kinds.append(kind)
+        said.append(f"object {number + 1}, {kind}: {why}")
     if set(kinds) == {CARVED}:
-        return Surface(hull.mesh, "", found.fit, Decision("hull not smoothed", "; ".join(said)))
+        assert fit is not None  # there are objects
+        return Surface(hull.mesh, "", fit, Decision("hull not smoothed", "; ".join(said)))
     whole = joined(meshes)
     before, after = (find_rims(MeshShape.of(mesh), views).spread for mesh in (hull.mesh, whole))
     fit = SurfaceFit(score(hull.mesh).mean, score(whole).mean, before, after, worst)
@@ -129,17 +145,17 @@ def _own_views(objects: Sequence[TriangleMesh], views: Sequence[RimView]) -> lis
     guides = [MeshGuide(mesh, 0.0) for mesh in objects]
     own: list[list[RimView]] = [[] for _ in objects]
     for view in views:
-        seen = [silhouette(guide, view.camera) for guide in guides]
+        seen = np.stack([silhouette(guide, view.camera) for guide in guides])
+        wide = np.stack([binary_dilation(each, iterations=_OTHERS) for each in seen])
+        crowd = wide.sum(0)
         for number, views_of_it in enumerate(own):
-            near = binary_dilation(seen[number], iterations=_OWN)
-            for other in [*seen[:number], *seen[number + 1 :]]:
-                near &= np.logical_not(binary_dilation(other, iterations=_OTHERS))
+            near = binary_dilation(seen[number], iterations=_OWN) & (crowd == wide[number])
             views_of_it.append(replace(view, usable=view.usable & near))
     return own
 
 
 def _candidates(
-    hull: TriangleMesh, voxel: float, views: list[RimView], settings: SurfaceSettings
+    hull: TriangleMesh, voxel: float, views: list[RimView], around: list[RimView], settings: SurfaceSettings
 ) -> Iterator[_Candidate]:
     """What is tried, the simplest first."""
     if settings.fit == "auto":
@@ -156,7 +172,7 @@ def _candidates(
         if flat is not None:
             said = f"a body of {len(flat.body.normals)} planes"
             yield _Candidate(flat.body.mesh(voxel), "planes", said, flat.contradicted)
-    free = fair_surface(hull, voxel, views, settings)
+    free = fair_surface(hull, voxel, around, settings)
     said = f"smoothed over {free.strength:.1f} voxels, less at {100 * free.sharp:.0f} % of the vertices, where the "
     said += f"outlines contradict; no outline tells of {100 * free.unseen:.1f} %"
     parts = [(free.feet, "made plane"), (free.held, "held where the hull is")]

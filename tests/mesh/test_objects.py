@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from rtgs.core.errors import RtgsError
+from rtgs.mesh import surface
 from rtgs.mesh.container import ObjectMesh, read_object_mesh, write_object_mesh
 from rtgs.mesh.pieces import joined, piece_labels, pieces, submesh
 from rtgs.mesh.record import AND, CARVED
@@ -60,6 +61,46 @@ def test_of_two_objects_the_one_that_masks_contradict_stays() -> None:
     assert np.abs(now[0].vertices - first.vertices).max() > 0
     np.testing.assert_array_equal(now[1].vertices, second.vertices)
     assert "object 2, carved: " in found.decision.why
+
+
+def test_one_form_of_all_pieces_comes_first() -> None:
+    """A speck beside a ball is no object that would change what the ball is."""
+    hull, masks = carved(sphere(0.6, 24), 40)
+    with_speck = replace(hull, mesh=joined([hull.mesh, sphere(0.1, 8, (0, 0, 0.75))]))
+    found = found_of(with_speck, masks)
+    assert (found.kind, len(pieces(found.mesh))) == ("sphere", 1)
+
+
+def test_objects_share_what_a_surface_may_cost() -> None:
+    """Each would be taken for itself, all together cost too much."""
+    balls = [sphere(0.25, 16, (x, y, 0)) for x in (-0.5, 0.5) for y in (-0.5, 0.5)]
+    hull, masks = carved(joined(balls), 48)
+    exact = silhouette_score(hull.mesh, masks.views)
+
+    def score(mesh: TriangleMesh):
+        """Every piece that is not as it was carved costs .002."""
+        kept = {piece.vertices.tobytes() for piece in pieces(hull.mesh)}
+        changed = sum(piece.vertices.tobytes() not in kept for piece in pieces(mesh))
+        return replace(exact, mean=exact.mean - 0.002 * changed)
+
+    found = find_surface(hull, masks, replace(FREE, iou_cost=0.003), score)
+    assert score(hull.mesh).mean - score(found.mesh).mean <= 0.003
+
+
+def test_an_object_that_hardly_any_outline_tells_of_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    hull, masks = carved(joined([sphere(0.3, 16, (-0.5, 0, 0)), sphere(0.3, 16, (0.5, 0, 0))]), 48)
+    second = pieces(hull.mesh)[1]
+    made = surface.fair_surface
+
+    def blind(mesh: TriangleMesh, *given):
+        found = made(mesh, *given)
+        return replace(found, unseen=0.9) if np.array_equal(mesh.vertices, second.vertices) else found
+
+    monkeypatch.setattr(surface, "fair_surface", blind)
+    found = find_surface(hull, masks, FREE, lambda mesh: silhouette_score(mesh, masks.views))
+    assert found.kind == f"free{AND}{CARVED}"
+    np.testing.assert_array_equal(pieces(found.mesh)[1].vertices, second.vertices)
+    assert f"object 2, {CARVED}: no outline tells of 90 %" in found.decision.why
 
 
 def test_pieces_are_counted_by_their_first_faces() -> None:
