@@ -43,10 +43,12 @@ def train_stage(params: StageParams, context: StepContext, object_mesh: ObjectMe
     from rtgs.methods import Stage, create_method
     from rtgs.methods.views import views_schedule
     from rtgs.scenes.canonical import read_scene
+    from rtgs.train.memory import share_one_heap
     from rtgs.train.progress import SharedProgress, progress_for
     from rtgs.train.seeds import generator_for
     from rtgs.train.trainer import Trainer
 
+    share_one_heap()
     scene = context.read("import_scene", read_scene)
     generator = generator_for(params.seed, "initialise")
     method = create_method(params.method, scene, params.schedule, generator, object_mesh)

@@ -1,7 +1,9 @@
 from __future__ import annotations
 
 import platform
+import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -31,3 +33,31 @@ def test_what_earlier_work_has_freed_is_handed_back_first():
     start_peak_memory()
     assert peak_memory_mb() < high - 200
     assert last.sum() == 8_000
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc has heaps for threads")
+@pytest.mark.parametrize(("first", "heaps"), [("share_one_heap()", "1"), ("pass", "more")])
+def test_threads_share_one_heap(first: str, heaps: str, tmp_path: Path):
+    """In a process of its own: it holds for the whole of it."""
+    code = f"""
+import ctypes, threading
+from rtgs.train.memory import share_one_heap
+{first}
+meet = threading.Barrier(3)
+library = ctypes.CDLL(None)
+library.malloc.restype = ctypes.c_void_p
+def allocate():
+    meet.wait()
+    assert library.malloc(5000)
+    meet.wait()
+threads = [threading.Thread(target=allocate) for _ in range(3)]
+[each.start() for each in threads]
+[each.join() for each in threads]
+library.fopen.restype = ctypes.c_void_p
+file = library.fopen({str(tmp_path / "info").encode()!r}, b"w")
+assert library.malloc_info(0, ctypes.c_void_p(file)) == 0
+library.fclose(ctypes.c_void_p(file))
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[2])
+    found = (tmp_path / "info").read_text().count("<heap nr=")
+    assert found == 1 if heaps == "1" else found > 1

@@ -232,7 +232,7 @@ def test_words_of_other_programs_and_slips_lead_to_the_key(word, key):
         ("samplez=1", "Did you mean samples or test_samples?"),
         ("points=1", "Did you mean features.points?"),
         ("features.pointz=1", "Did you mean features.points?"),
-        ("paths.rot=1", "Did you mean paths.root?"),
+        ("paths.rot=1", "Did you mean paths.root or paths.remote?"),
         ("output_dir=x", "Did you mean paths.root?"),
         ("iterations=1", "`rtgs run synthesize --help` lists its keys"),
     ],
