@@ -13,6 +13,7 @@ from rtgs.core.cameras import Camera
 from rtgs.evaluate.judgement import RegionErrors
 from rtgs.evaluate.metrics import psnr
 from rtgs.mesh.container import ObjectGuide, ObjectMesh
+from rtgs.mesh.pieces import piece_labels
 from rtgs.mesh.triangles import TriangleMesh
 
 _MOST_PIECES = 200  # a mesh of more is of loose triangles rather than of bodies: one object
@@ -49,11 +50,7 @@ def objects(mesh: TriangleMesh) -> np.ndarray:
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    faces, count = mesh.faces, len(mesh.vertices)
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
-    graph = coo_matrix((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(count, count))
-    labels = connected_components(graph, directed=False)[1][faces[:, 0]]
-    piece = np.unique(labels, return_inverse=True)[1].reshape(-1)
+    faces, piece = mesh.faces, piece_labels(mesh)
     pieces = int(piece.max()) + 1
     if pieces > _MOST_PIECES:
         return np.ones(len(faces), np.int64)
