@@ -109,8 +109,8 @@ def _surface_of(
 def _surfaces_of(
     objects: Sequence[TriangleMesh], hull: HullResult, views: list[RimView], settings: SurfaceSettings, score: Score
 ) -> Surface:
-    """Of several objects, one after the other, beside what the others have become. They share what a surface may cost;
-    a free one most that no outline tells of is left as it is."""
+    """Of several objects, one after the other, beside what the others have become. They share what a surface may cost.
+    Where no outline tells of most of a free surface, that object stays as it was carved."""
     meshes, kinds, said, worst, fit = list(objects), [], [], 0.0, None
     each_settings = replace(settings, iou_cost=settings.iou_cost / len(objects))
     for number, (mesh, own) in enumerate(zip(objects, _own_views(objects, views), strict=True)):
