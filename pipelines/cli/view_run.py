@@ -127,9 +127,9 @@ def viewed(config: RunConfig, plan: Plan) -> Iterator[Viewer | None]:
 
 def _trains(planned: PlannedStep) -> bool:
     """Whether a step is a training that will run here; one of the remote store is fetched."""
-    from rtgs.runs.mixture import PLAIN
+    from rtgs.runs.mixture import TRAININGS
 
-    training = planned.step.name == PLAIN or planned.step.name.startswith("train_")
+    training = planned.step.name.startswith(TRAININGS)
     return training and not planned.hit and not planned.remote
 
 

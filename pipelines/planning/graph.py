@@ -8,7 +8,15 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, replace
 
 from pipelines.planning.inspection import Inspections
-from pipelines.planning.judge import hold_out_views, judge_steps, why_unjudged
+from pipelines.planning.judge import (
+    Opponent,
+    hold_out_views,
+    judging_of,
+    rest_of,
+    until_judged,
+    why_judged_late,
+    why_unjudged,
+)
 from pipelines.planning.mask_plan import draws_panes
 from pipelines.planning.preparation import Preparation, prepare
 from pipelines.planning.transparent import Transparency, find_transparency
@@ -68,10 +76,10 @@ class RunGraph:
     evaluate: Step
     report: Step
     mesh: Step | None = None
-    judge: tuple[Step, ...] = ()  # the plain method's training, and the judge
+    judge: tuple[Step, ...] = ()  # the plain method's training, the judge, the rest of that training
     skipped: tuple[Decision, ...] = ()  # ``what`` is the name of the step
     unread: tuple[Decision, ...] = ()  # what the settings ask for and no step does
-    moved: tuple[Decision, ...] = ()  # what begins at another time than in other scenes
+    moved: tuple[Decision, ...] = ()  # what happens at another time than in other scenes
 
     @property
     def targets(self) -> tuple[Step, ...]:
@@ -95,15 +103,19 @@ def build_graph(config: RunConfig, choices: Choices, inspections: Inspections | 
     scene = prepared.scene
     transparency = find_transparency(config, inspection, prepared)
     networks = tuple(found for found in _pretrained() if found[1] != ABSENT)  # without them the key stays as it was
-    training, object_mesh = _training(config, prepared, transparency.present, networks)
-    judging = judge_steps(config, choices, prepared, training, networks)
-    rendered = _rendered(config, scene, *training, *judging)
+    opponent = Opponent.of(config, choices)
+    training, object_mesh = _training(config, prepared, opponent, transparency.present, networks)
+    judging = judging_of(config, opponent, scene, training, networks)
+    judge_steps = () if judging is None else judging.steps
+    if judging is not None:
+        training += rest_of(training[-1], config.schedule.total, judging.judge, networks)
+    rendered = _rendered(config, scene, *training, *judge_steps)
     measured = evaluate.STEP.step(
         evaluate.EvaluateParams(config.evaluation, row_label(config, choices), choices.preset),
         scene,
         *training,
         *(() if object_mesh is None else (object_mesh,)),
-        *judging,
+        *judge_steps,
         rendered,
         tools=_pretrained() if config.evaluation.lpips else (),
     )
@@ -113,10 +125,10 @@ def build_graph(config: RunConfig, choices: Choices, inspections: Inspections | 
         mesh = extract_mesh.STEP.step(_mesh_params(config), scene, *training)
     made = (rendered, measured) if mesh is None else (mesh, rendered, measured)
     unread = find_method(config.method.name).unread_losses(config.method)
-    moved = _moved_starts(config, transparency.present)
+    moved = (*_moved_starts(config, transparency.present), *why_judged_late(config, opponent))
     params = _report_params(config, choices, skipped, (*unread, *moved))
-    page = report.STEP.step(params, *prepared.steps, scene, *training, *judging, *made)
-    return RunGraph(scene, training, rendered, measured, page, mesh, judging, skipped, unread, moved)
+    page = report.STEP.step(params, *prepared.steps, scene, *training, *judge_steps, *made)
+    return RunGraph(scene, training, rendered, measured, page, mesh, judge_steps, skipped, unread, moved)
 
 
 def _rendered(config: RunConfig, scene: Step, *upstream: Step) -> Step:
@@ -160,9 +172,9 @@ def _left_out(config: RunConfig, transparency: Transparency, object_mesh: Step |
 
 
 def _training(
-    config: RunConfig, prepared: Preparation, transparent: bool, networks: Named
+    config: RunConfig, prepared: Preparation, opponent: Opponent | None, transparent: bool, networks: Named
 ) -> tuple[tuple[Step, ...], Step | None]:
-    """One training step per stage, and the object mesh that a third one builds on."""
+    """One training step per stage, up to where it is judged, and the object mesh that a third one builds on."""
     scene = prepared.scene
     method: MethodSettings = replace(config.method, paper_schedule=ScheduleSettings())  # a preset has read it by now
     steps: list[Step] = []
@@ -171,7 +183,7 @@ def _training(
     method = method.in_scene(glass=_through_glass(config, transparent))
     if spec.elsewhere:
         return (), None
-    for stage in spec.timeline(method, config.schedule, transparent=transparent):
+    for stage in until_judged(config, opponent, spec.timeline(method, config.schedule, transparent=transparent)):
         own = spec.stage(stage.name)
         read = own.reads(method)  # so that runs that differ elsewhere share the stage
         params = StageParams(read, config.schedule, config.seed, stage.name, stage.from_step, stage.until, config.watch)

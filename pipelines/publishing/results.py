@@ -29,7 +29,7 @@ from rtgs.evaluate.records import EvaluationTable, read_json
 from rtgs.prepare.masks.report import FILES as MASK_FILES
 from rtgs.prepare.poses.quality import PICTURE_FILE, REPORT_FILE
 from rtgs.report.files import link_files
-from rtgs.runs.mixture import PLAIN
+from rtgs.runs.mixture import plain_training
 from rtgs.runs.record import RUN_FILE, RunRecord
 from rtgs.runs.training import has_training, last_training, read_history, stage_params
 from rtgs.track import RunInfo, Tracker
@@ -206,7 +206,9 @@ def shown_training(results: Sequence[StepResult]) -> Path | None:
     if not was_trained(results):
         return None
     record = judge_record(results)
-    return folders(results)[PLAIN] if record is not None and record.all_plain else final_training(results)
+    if record is not None and record.all_plain:
+        return plain_training(folders(results))
+    return final_training(results)
 
 
 def config_yaml(config: RunConfig) -> str:

@@ -52,7 +52,7 @@ def _curve(config: RunConfig, results: Sequence[StepResult]) -> QualityCurve:
     facts = evaluation_of(results).facts
     stages = sorted(
         (result for result in results if result.step.name.startswith("train_")),
-        key=lambda result: stage_params(result.folder).from_step,
+        key=lambda result: stage_params(result.folder).until,
     )
     looks = [look for stage in stages for look in _looks(stage.folder)]
     if not looks:
@@ -64,7 +64,9 @@ def _curve(config: RunConfig, results: Sequence[StepResult]) -> QualityCurve:
 
 
 def _awaited_mesh(stage: StepResult, results: Sequence[StepResult]) -> StepResult | None:
-    """The mesh that a stage waited for; None: it waited for none."""
+    """The mesh that a stage waited for; None: it waited for none, or is the rest of one that has waited."""
+    if stage_params(stage.folder).joined:
+        return None
     awaited = {step.fingerprint for step in stage.step.upstream if step.name == "extract_mesh"}
     return next((result for result in results if result.step.fingerprint in awaited), None)
 

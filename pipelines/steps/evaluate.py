@@ -18,7 +18,7 @@ from rtgs.evaluate.judgement import JudgeRecord
 from rtgs.evaluate.networks import check_networks
 from rtgs.evaluate.settings import EvaluationSettings
 from rtgs.mesh.record import MeshRecord
-from rtgs.runs.mixture import PLAIN
+from rtgs.runs.mixture import TRAININGS, plain_training
 from rtgs.runs.training import has_training, last_training
 from rtgs.workflow import StepContext, StepKind
 from rtgs.workflow.manifest import Manifest
@@ -117,12 +117,14 @@ def _summary(inputs: Mapping[str, Path]) -> TrainSummary | None:
     full = _with_mesh(read_summary(last_training(inputs)), inputs)
     if JUDGE.name not in inputs:
         return full
-    plain, record = read_summary(inputs[PLAIN]), JudgeRecord.read(inputs[JUDGE.name])
+    plain, record = read_summary(plain_training(inputs)), JudgeRecord.read(inputs[JUDGE.name])
+    peaks = (read_summary(folder).peak_memory_mb for name, folder in inputs.items() if name.startswith(TRAININGS))
     return replace(
         full,
+        steps=plain.steps if record.all_plain else full.steps,
         seconds=full.seconds + plain.seconds,
         cpu_seconds=full.cpu_seconds + plain.cpu_seconds,
-        peak_memory_mb=max(full.peak_memory_mb, plain.peak_memory_mb),
+        peak_memory_mb=max(peaks),
         surfels=(0 if record.all_plain else full.surfels) + (plain.surfels if record.replaced else 0),
     )
 

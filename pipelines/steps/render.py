@@ -10,14 +10,13 @@ from typing import TYPE_CHECKING
 from rtgs.core.errors import RtgsError
 from rtgs.core.recipe import UNLESS_DEFAULT
 from rtgs.core.records import read_record, write_json
+from rtgs.runs.framing import covered, framing_counts
 from rtgs.runs.mixture import Mixture, read_mixture
 from rtgs.runs.training import last_training, load_method
 from rtgs.runs.views import COVERAGE, read_coverage, read_render, view_maps
 from rtgs.workflow import StepContext, StepKind
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from torch import Tensor
 
     from rtgs.core.cameras import Camera
@@ -158,7 +157,8 @@ def render(params: RenderParams, context: StepContext) -> None:
         save_file(tensors, context.out / "views" / f"{stem}.safetensors")
         write_png(context.out / "images" / f"{stem}.png", to_bytes(image))
     if surfaces:
-        save_file(_coverage(method, scene, stage.until, surfaces), context.out / COVERAGE)
+        photos = (*scene.train, *scene.held) if stage.joined else scene.train
+        save_file(framing_counts(method, stage.until, scene.test, surfaces, photos), context.out / COVERAGE)
     if params.preview:
         _write_preview(method, scene, stage.until, mixture, params.preview, context.out / PREVIEW)
     if method.light is not None:
@@ -236,42 +236,9 @@ def _write_preview(method: Model, scene: Scene, step: int, mixture: Mixture | No
         write_preview(path, frames, PREVIEW_RATE, PREVIEW_BYTES)
 
 
-def _coverage(method: Model, scene: Scene, step: int, surfaces: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """By test view: (H, W) int16 training views that show what the pixel shows, where it is ``surfaces`` (z-depth)."""
-    from rtgs.evaluate.coverage import at_size, framed_by, judged
-
-    pictures = []
-    for view in scene.test:
-        camera = judged(view.camera)
-        pictures.append((camera, at_size(surfaces[view.name], camera.height, camera.width)))
-    cameras = (judged(view.camera) for view in scene.train)
-    counts = framed_by(pictures, ((camera, _base_surface(method, camera, step)) for camera in cameras))
-    sizes = ((view.camera.height, view.camera.width) for view in scene.test)
-    return {view.name: at_size(count, *size) for view, count, size in zip(scene.test, counts, sizes, strict=True)}
-
-
-def _base_surface(method: Model, camera: Camera, step: int) -> Tensor:
-    """(H, W) z-depth of the base set, 0 where it covers less than half of the pixel."""
-    import torch
-
-    from rtgs.methods import Mode, RenderOptions
-    from rtgs.methods.parts.part import Frame
-    from rtgs.train.losses import surface_depth
-
-    wanted = RenderOptions(depth=True)
-    with torch.no_grad():
-        found = method.base.rasterize(Frame(camera, step, Mode.EVALUATE, wanted), wanted).buffers
-    assert found.depth is not None
-    return _covered(surface_depth(found.depth, found.alpha), found.alpha)
-
-
 def _first_surface(view: View, maps: dict[str, Tensor]) -> Tensor:
     """(H, W) z-depth of what a test view shows, the true one where it is known; 0: nothing."""
-    return view.truth.depth if view.truth is not None else _covered(maps["depth"], maps["alpha"])
-
-
-def _covered(depth: Tensor, alpha: Tensor) -> Tensor:
-    return depth * (alpha > 0.5)
+    return view.truth.depth if view.truth is not None else covered(maps["depth"], maps["alpha"])
 
 
 def read_timed(folder: Path, times: RenderTimes, view_name: str, camera: Camera | None = None) -> TimedRender:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from rtgs.core.documents import DocumentError, parse_json
 from rtgs.core.records import read_json, record_of, write_json
+from rtgs.runs.mixture import TRAININGS
 from rtgs.runs.training import CHECKPOINT_FOLDER, HISTORY_FILE, OBJECT_FOLDER, StageParams
 from rtgs.track import Tracker
 from rtgs.workflow import StepContext
@@ -52,7 +53,7 @@ def train_stage(params: StageParams, context: StepContext, object_mesh: ObjectMe
     scene = context.read("import_scene", read_scene)
     generator = generator_for(params.seed, "initialise")
     method = create_method(params.method, scene, params.schedule, generator, object_mesh)
-    stage = Stage(params.stage, params.from_step, params.until)
+    stage = Stage(params.stage, params.from_step, params.until, params.joined)
     checkpoints = context.partial / "checkpoints"
     _start_from_stage_before(context, checkpoints)
     recorder = HistoryRecorder(context.partial / HISTORY_FILE, context.tracker)
@@ -95,9 +96,15 @@ def _start_from_stage_before(context: StepContext, checkpoints: Path) -> None:
     """A later stage goes on from the state at the end of the one before, unless it has a checkpoint of its own."""
     from rtgs.train.checkpoint import adopt_checkpoint
 
-    before = [folder for name, folder in context.inputs.items() if name.startswith("train_")]
-    if before and not any(checkpoints.glob("step_*")):
-        adopt_checkpoint(before[-1] / CHECKPOINT_FOLDER, checkpoints)
+    before = training_before(context.inputs)
+    if before is not None and not any(checkpoints.glob("step_*")):
+        adopt_checkpoint(before / CHECKPOINT_FOLDER, checkpoints)
+
+
+def training_before(inputs: Mapping[str, Path]) -> Path | None:
+    """The artifact of the training that a training step goes on from; None: it is the first."""
+    before = [folder for name, folder in inputs.items() if name.startswith(TRAININGS)]
+    return before[-1] if before else None
 
 
 def _finite(value: object) -> object:

@@ -119,9 +119,13 @@ class JudgeConfig:
     """The plain method, a file of ``conf/method``: it is trained as well, on the same views. Empty: no judge."""
     every: int = 12
     """About every n-th training view is held out for it (``scene.hold_out``, which goes first where it is not 0)."""
+    at: float = 0.7
+    """Share of the method's last stage after which both are judged; from there on what is shown is trained on the
+    held-out views as well, and what is not shown ends. 1: at the end, and no method learns from them."""
 
     def __post_init__(self) -> None:
         refuse_below("judge.every", self.every, 1)
+        refuse_unless(0 < self.at <= 1, "judge.at", self.at, "above 0, at most 1")
 
 
 @dataclass(frozen=True)

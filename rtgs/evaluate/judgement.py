@@ -7,14 +7,18 @@ from __future__ import annotations
 
 import math
 import statistics
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Literal
 
 from rtgs.core.decisions import Decision
 from rtgs.core.records import read_record, write_json
 
+Role = Literal["full", "plain"]  # the method of the run, and the plain one
 RECORD_FILE = "judge.json"
 LEAST_VIEWS = 2  # that show a region: from one view nobody knows how much views differ
+SURE = 2  # standard errors by which a difference is told from chance
 LEAST_PIXELS = 64  # of a region in a view that is to count
 
 
@@ -24,7 +28,7 @@ class RegionErrors:
 
     Attributes:
         region: its name in words.
-        pixels: in each view.
+        pixels: in each view, of those that count.
         full, plain: mean squared error over those pixels and the channels, images in [0, 1]; at least 1e-10. Without
             meaning where there are no pixels.
     """
@@ -66,17 +70,17 @@ class Verdict:
         errors = (self.plain_error, self.full_error) if self.kept == "plain" else (self.full_error, self.plain_error)
         text = f"error {errors[0]:.3g} against {errors[1]:.3g} on {self.views} held-out views"
         text += f", {abs(self.gain):.2f} dB with a standard error of {self.spread:.2f}"
-        return text if abs(self.gain) > 2 * self.spread else f"{text}: too close to be sure"
+        return text if abs(self.gain) > SURE * self.spread else f"{text}: too close to be sure"
 
 
 def verdict(errors: RegionErrors) -> Verdict:
-    """Keep the full method where it beats the plain one: where its PSNR is higher, in the mean over the held-out views.
+    """Show the plain method where its PSNR is higher, in the mean over the held-out views, by more than :data:`SURE`
+    standard errors of the difference. Elsewhere the full method, which was asked for, stays; of two that are the same
+    to the bit the plain one is shown.
 
     Views are compared in pairs, for views differ more than methods do, and each counts alike, as in the tables. Where
-    too few views show the region the full method stays: there is nothing to judge it by.
-
-    The sign of the mean decides, however near to 0 it is. To be wrong there costs as much either way, and what it costs
-    is then small. The standard error is told beside it.
+    too few views show the region the full method stays: there is nothing to judge it by. The doubt is the full one's
+    because both are judged before their ends: its last stage began later and has more to gain (docs/judge.md).
     """
     shown = [index for index, count in enumerate(errors.pixels) if count >= LEAST_PIXELS]
     pixels = sum(errors.pixels[index] for index in shown)
@@ -85,15 +89,16 @@ def verdict(errors: RegionErrors) -> Verdict:
     full, plain = ([10 * math.log10(each[index]) for index in shown] for each in (errors.full, errors.plain))
     gains = [other - own for own, other in zip(full, plain, strict=True)]
     gain = statistics.fmean(gains)
+    spread = statistics.stdev(gains) / math.sqrt(len(gains))
     return Verdict(
         errors.region,
-        "full" if gain > 0 else "plain",
+        "full" if gain > -SURE * spread else "plain",
         len(shown),
         pixels,
         10 ** (statistics.fmean(full) / 10),
         10 ** (statistics.fmean(plain) / 10),
         gain,
-        statistics.stdev(gains) / math.sqrt(len(gains)),
+        spread,
     )
 
 
@@ -105,12 +110,15 @@ class JudgeRecord:
         full, plain: names of the methods.
         views: names of the held-out views.
         regions: in the order of :class:`rtgs.evaluate.regions.Regions`.
+        at: steps of both trainings at which they were judged, and from which on the held-out views are trained on as
+            well; None: at their ends.
     """
 
     full: str
     plain: str
     views: tuple[str, ...]
     regions: tuple[Verdict, ...]
+    at: tuple[int, int] | None = None
 
     @property
     def replaced(self) -> tuple[int, ...]:
@@ -122,15 +130,35 @@ class JudgeRecord:
         """Nothing of the full method is left to see."""
         return len(self.replaced) == len(self.regions)
 
+    def shows(self, role: Role) -> bool:
+        """Whether a region shows this one of the two."""
+        return any(region.kept == role for region in self.regions)
+
     def decisions(self) -> tuple[Decision, ...]:
-        """For log and report: what each region shows, and of which method the files of Gaussians are."""
+        """For log and report: what each region shows, what was trained further, and of which method the files of
+        Gaussians are."""
         lines = [Decision(f"kept {self._method(each)} in {each.region}", each.figures) for each in self.regions]
+        lines += self._after_it()
         if self.all_plain:
             lines.append(Decision("files of Gaussians", f"they are of {self.plain}, which was kept everywhere"))
         elif self.replaced:
             why = f"they are of {self.full} alone, so are the maps and layers: files of two methods cannot be mixed"
             lines.append(Decision("files of Gaussians", why))
         return tuple(lines)
+
+    def _after_it(self) -> Iterator[Decision]:
+        if self.at is None:
+            return
+        steps: dict[Role, str] = {
+            "full": f"{self.full} from step {self.at[0]} on",
+            "plain": f"the plain {self.plain} from step {self.at[1]} on",
+        }
+        if self.views:
+            shown = " and ".join(told for role, told in steps.items() if self.shows(role))
+            yield Decision(f"{len(self.views)} held-out views are trained on", f"{shown}: there both were judged")
+        for role, told in steps.items():
+            if not self.shows(role):
+                yield Decision("training stopped", f"{told}: no region shows it")
 
     def _method(self, region: Verdict) -> str:
         return f"the plain {self.plain}" if region.kept == "plain" else self.full

@@ -16,6 +16,7 @@ from rtgs.mesh.container import ObjectGuide, ObjectMesh
 from rtgs.mesh.pieces import piece_labels
 from rtgs.mesh.triangles import TriangleMesh
 
+NOWHERE = -1  # number of a pixel that counts in no region
 _MOST_PIECES = 200  # a mesh of more is of loose triangles rather than of bodies: one object
 
 
@@ -70,7 +71,7 @@ def objects(mesh: TriangleMesh) -> np.ndarray:
 class Pair:
     """A photo and what the two methods make of it."""
 
-    numbers: Tensor  # (H, W) region of each pixel
+    numbers: Tensor  # (H, W) region of each pixel, or NOWHERE
     photo: Tensor  # (3, H, W)
     full: Tensor  # (3, H, W)
     plain: Tensor  # (3, H, W)

@@ -19,7 +19,14 @@ if TYPE_CHECKING:
     from rtgs.scenes.scene import Scene
 
 JUDGE = "judge"  # names of steps: of the one that decides,
-PLAIN = "plain"  # and of the one that trains the plain method
+PLAIN = "plain"  # of the one that trains the plain method
+REST = "_rest"  # and what the names of those end with that go on with a training after both were judged
+TRAININGS = ("train_", PLAIN)  # what the names of all steps that train begin with
+
+
+def plain_training(inputs: Mapping[str, Path]) -> Path:
+    """The artifact of the plain method's training as it ended, among the inputs of a step."""
+    return inputs.get(PLAIN + REST, inputs[PLAIN])
 
 
 def regions_of(inputs: Mapping[str, Path]) -> Regions:
@@ -64,5 +71,5 @@ def read_mixture(inputs: Mapping[str, Path], scene: Scene) -> Mixture | None:
     replaced = JudgeRecord.read(inputs[JUDGE]).replaced
     if not replaced:
         return None
-    plain, stage = load_method(inputs[PLAIN], scene)
+    plain, stage = load_method(plain_training(inputs), scene)
     return Mixture(regions_of(inputs), replaced, plain, stage.until)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from rtgs.core.build import build
 from rtgs.core.documents import parse_json
 from rtgs.core.errors import RtgsError
-from rtgs.core.recipe import UNLESS
+from rtgs.core.recipe import UNLESS, UNLESS_DEFAULT
 from rtgs.methods.settings import MethodSettings
 from rtgs.train.settings import ScheduleSettings, WatchSettings
 from rtgs.workflow.manifest import Manifest
@@ -27,7 +27,10 @@ HISTORY_FILE = "history.jsonl"
 
 @dataclass(frozen=True)
 class StageParams:
-    """One stage of a training: the recipe, the seed, and which stretch of steps."""
+    """One stage of a training: the recipe, the seed, and which stretch of steps.
+
+    ``joined``: not 0 where the stage was trained up to this step and is gone on with, on held-out views as well.
+    """
 
     method: MethodSettings
     schedule: ScheduleSettings
@@ -36,6 +39,7 @@ class StageParams:
     from_step: int
     until: int
     watch: WatchSettings = field(default_factory=WatchSettings, metadata={"recipe": UNLESS, "value": WatchSettings()})
+    joined: int = field(default=0, metadata=UNLESS_DEFAULT)
 
 
 def stage_params(folder: Path) -> StageParams:

@@ -57,7 +57,7 @@ class Scene:
     point_colors: Tensor  # (P, 3) float32 in 0..1
     extent: float  # 1.1 x largest distance of the training cameras to their mean, world units
     source: str  # where it came from: format, split rule, origin of the points
-    held: tuple[View, ...] = ()  # kept from training and testing alike: methods are compared on them
+    held: tuple[View, ...] = ()  # neither trained on nor tested: methods are compared on them, then trained
     noise_psnr: float | None = None  # dB of the test photos against noise-free ones, mean; where that is known
     random_points: bool = False  # the points are drawn at random: no photo agrees on them
 

@@ -82,7 +82,7 @@ class SceneSettings:
     """Seed of random points."""
     hold_out: int = field(default=0, metadata=UNLESS_DEFAULT)
     """About every n-th training view is neither trained on nor a test view, spread evenly; at least 2, at most 12, and
-    none of fewer than 8. 0: none. The judge compares methods on them (``judge.every``)."""
+    none of fewer than 8. 0: none. The judge compares methods on them (``judge.every``) and then trains on them."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "background", tuple(float(c) for c in self.background))

@@ -25,6 +25,7 @@ from rtgs.core.files import sha256_of
 from rtgs.core.recipe import left_out_at
 from rtgs.core.records import record_of
 from rtgs.core.refuse import cut
+from rtgs.scenes.scene import Scene
 from rtgs.train.settings import ScheduleSettings
 
 FORMAT = 1
@@ -270,3 +271,16 @@ def _flush(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def scene_digest(scene: Scene) -> str:
+    """Digest of training and test views and points: cameras, and a sample of every image and normal map."""
+    sha = hashlib.sha256()
+    for view in (*scene.train, *scene.test):
+        camera = view.camera
+        sha.update(repr((view.name, camera.fx, camera.fy, camera.cx, camera.cy, *view.image.shape)).encode())
+        for tensor in (camera.rotation, camera.translation, view.image.flatten()[::97]):
+            sha.update(tensor.contiguous().numpy().tobytes())
+        sha.update(b"no normals" if view.normal is None else view.normal.flatten()[::97].contiguous().numpy().tobytes())
+    sha.update(scene.points.contiguous().numpy().tobytes())
+    return sha.hexdigest()[:16]

@@ -37,6 +37,7 @@ class Stage:
     name: str
     from_step: int  # first step of the stage
     until: int  # first step that no longer belongs to it
+    joined: int = 0  # it is trained up to this step, and is gone on with on held-out views as well; 0: it is begun
 
 
 @dataclass(frozen=True)

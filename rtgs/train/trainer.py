@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 import platform
 from collections.abc import Callable, Iterator
@@ -19,6 +18,7 @@ from rtgs.native.threads import SERIAL_PIXELS, serial_torch, threads
 from rtgs.scenes.scene import Scene
 from rtgs.train.checkpoint import (
     Checkpoint,
+    CheckpointError,
     CheckpointRecord,
     RunSettings,
     canonical_json,
@@ -26,6 +26,7 @@ from rtgs.train.checkpoint import (
     digest,
     load_newest,
     save_checkpoint,
+    scene_digest,
 )
 from rtgs.train.clock import Clock, ElapsedTime
 from rtgs.train.guard import check_loss, diverged
@@ -123,8 +124,10 @@ class Trainer:
         self._idle = why_idle(watch, tested=bool(scene.test), recorded=recorder is not None)
         self._watch = Watch(watch) if watch is not None and watch.on and not self._idle else None
         self._views = views
-        self._growing = GrowingViews(scene.train, self.schedule)
-        self._order = ViewOrder(len(scene.train), seed_for(seed, "views"))
+        joined = self.stage.joined > 0
+        self._photos = (*scene.train, *scene.held) if joined else scene.train
+        self._growing = GrowingViews(self._photos, self.schedule)
+        self._order = ViewOrder(len(self._photos), seed_for(seed, "joined views" if joined else "views"))
         self._averages = RunningAverages()
         self._held_out = HeldOutView(scene, self.schedule.total)
         self._seen: float | None = None  # its PSNR when it was last looked at
@@ -150,7 +153,7 @@ class Trainer:
         TrainingDiverged
             A loss or gradient is not finite; the last checkpoint is intact.
         CheckpointError
-            ``checkpoint_dir`` holds checkpoints that cannot be used.
+            ``checkpoint_dir`` holds checkpoints that cannot be used, or none of a stage that is to be gone on with.
         TrainingStopped
             The onlooker asked for the end; the present state is the last checkpoint.
         """
@@ -168,7 +171,7 @@ class Trainer:
             if first == self.stage.from_step:
                 self._note(first, self.method.begin(self.stage))
             self._show_as_told()
-            largest = max(view.camera.width * view.camera.height for view in self.scene.train)
+            largest = max(view.camera.width * view.camera.height for view in self._photos)
             with serial_torch(largest <= SERIAL_PIXELS):
                 while self._step < self.stage.until:
                     self._train_step()
@@ -311,7 +314,8 @@ class Trainer:
 
     def _announce(self, resumed_from: int | None) -> None:
         if resumed_from is not None:
-            if resumed_from > self.stage.from_step:  # else it is the end of the stage before
+            begins = (self.stage.from_step, self.stage.joined)  # with a checkpoint that another step made
+            if resumed_from not in begins:
                 self.progress.note(f"resumed from the checkpoint of step {resumed_from}")
             return
         for decision in self._decisions:
@@ -321,23 +325,29 @@ class Trainer:
         """Views as the stage has them, now that it has begun."""
         if self._views is None or (told := self._views()) == self.schedule:
             return
-        self._growing = GrowingViews(self.scene.train, told, f"so the {self.stage.name} stage learns at less cost")
+        self._growing = GrowingViews(self._photos, told, f"so the {self.stage.name} stage learns at less cost")
         if self._step == self.stage.from_step:
             for decision in self._growing.decisions:
                 self.progress.note(f"{decision.what}: {decision.why}")
 
     def _resume(self) -> int | None:
         """Load the newest checkpoint, if there is one, and return its step."""
-        if self.checkpoint_dir is None:
-            return None
-        checkpoint = load_newest(self.checkpoint_dir, warn=self.progress.note)
+        place = self.checkpoint_dir
+        checkpoint = None if place is None else load_newest(place, warn=self.progress.note)
         if checkpoint is None:
+            if self.stage.joined:
+                raise CheckpointError(
+                    f"the {self.stage.name} stage is to go on from step {self.stage.joined}, and there is no "
+                    f"checkpoint in {place}: train up to that step first"
+                )
             return None
         record, tensors = checkpoint.record, checkpoint.tensors
         check_resumable(record, self._expected_record(record.step), self._run, warn=self.progress.note)
         prefix = "method."
         self.method.load({name[len(prefix) :]: t for name, t in tensors.items() if name.startswith(prefix)})
-        self._order.load(OrderState(tensors["views.permutation"], record.order_position, tensors["views.generator"]))
+        if record.step != self.stage.joined:  # else its order is that of fewer views
+            order = OrderState(tensors["views.permutation"], record.order_position, tensors["views.generator"])
+            self._order.load(order)
         self._averages = RunningAverages(record.loss_average, record.psnr_average)
         self._step = record.step
         self._elapsed_before = ElapsedTime(record.elapsed, record.elapsed_cpu)
@@ -383,16 +393,3 @@ class Trainer:
     def _report(self) -> StepReport:
         averages = self._averages
         return StepReport(self._step, averages.loss or 0.0, averages.psnr or 0.0, self._surfels(), self._seen)
-
-
-def scene_digest(scene: Scene) -> str:
-    """Digest of what training sees of a scene: cameras, points, and a sample of every image and normal map."""
-    sha = hashlib.sha256()
-    for view in (*scene.train, *scene.test):
-        camera = view.camera
-        sha.update(repr((view.name, camera.fx, camera.fy, camera.cx, camera.cy, *view.image.shape)).encode())
-        for tensor in (camera.rotation, camera.translation, view.image.flatten()[::97]):
-            sha.update(tensor.contiguous().numpy().tobytes())
-        sha.update(b"no normals" if view.normal is None else view.normal.flatten()[::97].contiguous().numpy().tobytes())
-    sha.update(scene.points.contiguous().numpy().tobytes())
-    return sha.hexdigest()[:16]

@@ -30,12 +30,13 @@ OTHER_SECONDS = 10.0
 TRAINING_STEP_SECONDS = {"plain": 0.015, "train_diffuse": 0.015, "train_reflection": 0.06, "train_shading": 0.06}
 TRAINING_STEP_SECONDS |= {"train_transmittance": 0.1}
 OTHER_TRAINING_STEP_SECONDS = 0.1
+_REST = "_rest"  # of a training: at the pace of what it goes on with, unless a judge has dropped it
 _PRIOR_SECONDS = 20.0  # weight of the expectation against what was seen
 
 
 def training_steps(params: Mapping[str, Any]) -> int | None:
     """How many training steps a recipe asks for; None where it is no training."""
-    first, until = params.get("from_step"), params.get("until")
+    first, until = params.get("joined") or params.get("from_step"), params.get("until")
     return until - first if isinstance(first, int) and isinstance(until, int) else None
 
 
@@ -48,11 +49,12 @@ class Expectation:
 
     def seconds(self, step: Step) -> float:
         """Of runs of this step name, those of the same method if there are any; training by the number of its steps."""
-        if step.name not in self._recorded:
-            self._recorded[step.name] = [artifact.manifest for artifact in self._store.artifacts(step.name)]
-        count, recorded = training_steps(step.recipe), self._recorded[step.name]
+        name = step.name.removesuffix(_REST)
+        if name not in self._recorded:
+            self._recorded[name] = [artifact.manifest for artifact in self._store.artifacts(name)]
+        count, recorded = training_steps(step.recipe), self._recorded[name]
         if not recorded:
-            return _from_table(step.name, count)
+            return _from_table(name, count)
         method = _method(step.recipe)
         alike = [manifest for manifest in recorded if _method(manifest.params) == method] or recorded
         if count is None:
@@ -84,7 +86,8 @@ class PlanClock:
         todo = [planned.step for planned in plan if not planned.hit]
         self.weights = {step.fingerprint: max(expectation.seconds(step), 0.01) for step in todo}
         self._left = dict(self.weights)
-        self._tells = {step.fingerprint for step in todo if training_steps(step.recipe) is not None}
+        trainings = (step for step in todo if training_steps(step.recipe) is not None)
+        self._tells = {step.fingerprint for step in trainings if not step.name.endswith(_REST)}
         self._lanes = max(1, lanes)
         self._now = now
         self._expected = self._took = _PRIOR_SECONDS

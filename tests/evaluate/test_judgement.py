@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import pytest
 
@@ -66,12 +67,23 @@ def test_views_that_show_too_little_do_not_count():
 
 
 def test_errors_decide_as_the_means_that_are_told():
-    """Whatever the errors, the method that is kept is the one whose geometric mean is lower."""
+    """Whatever the errors, the gain is that of the geometric means."""
     for full, plain in (([0.3, 0.01], [0.1, 0.02]), ([0.02, 0.05], [0.03, 0.04]), ([1e-10, 0.2], [1e-3, 1e-5])):
         found = verdict(errors(full, plain))
         assert found.full_error is not None
         assert found.plain_error is not None
-        assert (found.kept == "full") == (found.full_error < found.plain_error)
+        assert found.gain == pytest.approx(10 * math.log10(found.plain_error / found.full_error))
+
+
+@pytest.mark.parametrize(("lead", "kept"), [(1.9, "full"), (2.1, "plain")])
+def test_a_plain_method_that_leads_by_less_than_two_standard_errors_is_not_shown(lead: float, kept: str):
+    """It leads by ``lead`` dB in the mean of two views that differ by 2 dB: a standard error of 1 dB."""
+    plain = [0.01 * 10 ** (-(lead + sign) / 10) for sign in (-1, 1)]
+    found = verdict(errors([0.01, 0.01], plain))
+    assert found.gain == pytest.approx(-lead)
+    assert found.spread == pytest.approx(1.0)
+    assert found.kept == kept
+    assert found.figures.endswith("too close to be sure") == (kept == "full")
 
 
 def record(*kept: str) -> JudgeRecord:
@@ -98,6 +110,23 @@ def test_the_record_says_what_is_shown_and_whose_files_these_are(tmp_path, kept,
     assert [line.what for line in lines[:2]] == [f"{named[each]} in region {n}" for n, each in enumerate(kept)]
     assert [line.what for line in lines[2:]] == (["files of Gaussians"] if files else [])
     assert files in lines[-1].why
+
+
+def test_the_record_says_what_learned_from_the_held_out_views(tmp_path):
+    for kept, told in {
+        ("full", "full"): "rtgs from step 70 on: there both were judged",
+        ("full", "plain"): "rtgs from step 70 on and the plain 3dgs from step 140 on: there both were judged",
+        ("plain", "plain"): "the plain 3dgs from step 140 on: there both were judged",
+    }.items():
+        judged = replace(record(*kept), at=(70, 140))
+        judged.write(tmp_path)
+        assert JudgeRecord.read(tmp_path) == judged
+        lines = {line.what: line.why for line in judged.decisions()}
+        assert lines["2 held-out views are trained on"] == told
+        ended = {"full": "the plain 3dgs from step 140 on", "plain": "rtgs from step 70 on"}.get(kept[0])
+        alone = kept[0] == kept[1]
+        assert lines.get("training stopped") == (f"{ended}: no region shows it" if alone else None)
+        assert [judged.shows("full"), judged.shows("plain")] == ["full" in kept, "plain" in kept]
 
 
 def test_a_damaged_record_is_refused(tmp_path):

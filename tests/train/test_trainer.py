@@ -14,11 +14,11 @@ from training_cases import small_method, small_scene, small_schedule, small_trai
 
 from rtgs.native.threads import threads
 from rtgs.train import trainer as trainer_module
-from rtgs.train.checkpoint import load_newest
+from rtgs.train.checkpoint import load_newest, scene_digest
 from rtgs.train.guard import TrainingDiverged
 from rtgs.train.progress import LineProgress, StepReport
 from rtgs.train.settings import LossSettings
-from rtgs.train.trainer import Trainer, scene_digest
+from rtgs.train.trainer import Trainer
 
 
 class Memory:

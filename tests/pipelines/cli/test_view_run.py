@@ -222,7 +222,10 @@ def step(name: str) -> Step:
 
 @pytest.mark.parametrize(
     ("name", "remote", "opens"),
-    [("plain", False, True), ("train_diffuse", False, True), ("train_diffuse", True, False), ("judge", False, False)],
+    [
+        *(("plain", False, True), ("plain_rest", False, True), ("train_diffuse_rest", False, True)),
+        *(("train_diffuse", False, True), ("train_diffuse", True, False), ("judge", False, False)),
+    ],
 )
 def test_a_page_is_opened_for_what_trains_here_alone(name, remote, opens, monkeypatch):
     opened = []

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import pytest
 
 from pipelines.planning.graph import RunGraph, build_graph, shown_values
@@ -9,7 +12,8 @@ from rtgs.config import compose
 from rtgs.config.compose import compose_plain
 from rtgs.config.schema import Choices
 from rtgs.core.errors import RtgsError
-from rtgs.workflow import topological
+from rtgs.workflow import Store, topological
+from rtgs.workflow.expectation import Expectation
 
 GLASS = ("scene=ball_statue", "method=rtgs", "preset=smoke")
 
@@ -25,23 +29,65 @@ def keys(found: RunGraph) -> dict[str, str]:
 
 def test_the_plain_method_is_trained_on_the_same_scene_and_the_judge_sees_both():
     found = graph(*GLASS, "judge=photos")
-    plain, judge = found.judge
+    plain, judge, plain_rest = found.judge
+    *until, rest = found.training
     assert found.scene.params.settings.hold_out == 12
     assert plain.upstream == (found.scene,)
-    assert judge.upstream == (found.scene, *found.training, plain)
-    assert {step.name for step in found.training} == {"train_diffuse", "train_reflection", "train_transmittance"}
+    assert judge.upstream == (found.scene, *until, plain)
+    assert [step.name for step in until] == ["train_diffuse", "train_reflection", "train_transmittance"]
     assert all(found.scene in step.upstream for step in found.training)
+    assert (rest.name, plain_rest.name) == ("train_transmittance_rest", "plain_rest")
+    assert rest.upstream == (*until[-1].upstream, until[-1], judge)
+    assert plain_rest.upstream == (found.scene, plain, judge)
     for reader in (found.render, found.evaluate, found.report):
-        assert {plain, judge} <= set(reader.upstream)
+        assert {plain, judge, rest, plain_rest} <= set(reader.upstream)
     assert found.evaluate.params.method == "rtgs, judged"
     assert (judge.params.full, judge.params.plain) == ("rtgs", "3dgs")
     assert compose([*GLASS, "judge=photos"])[0].name == "ball_statue-rtgs-smoke-judged"
 
 
+def test_both_are_judged_in_the_last_stage_at_one_share_of_the_run_and_gone_on_with_from_there():
+    found = graph(*GLASS, "judge=photos", "judge.at=0.5", "method.transmittance.start=0.6", "schedule.total=200")
+    plain, judge, plain_rest = found.judge
+    *_, last, rest = found.training
+    assert (last.params.from_step, last.params.until, judge.params.at) == (120, 160, (160, 160))
+    for first, second in ((last, rest), (plain, plain_rest)):
+        total = first.params.schedule.total
+        assert (first.params.until, first.params.joined) == (total * 4 // 5, 0)
+        assert second.params == replace(first.params, until=total, joined=total * 4 // 5)
+    expected = Expectation(Store(Path("nowhere")))
+    assert expected.seconds(plain_rest) == pytest.approx(expected.seconds(plain) / 4)
+
+
+def test_judged_at_the_end_nothing_goes_on():
+    found = graph(*GLASS, "judge=photos", "judge.at=1")
+    assert [step.name for step in found.judge] == ["plain", "judge"]
+    assert found.training[-1].name == "train_transmittance"
+    assert found.training[-1].params.until == found.training[-1].params.schedule.total
+    assert found.judge[1].params.at is None
+
+
+@pytest.mark.parametrize("part", ["poses", "appearance"])
+def test_what_is_learned_of_each_photo_needs_all_of_it(part: str):
+    words = ("scene=ball_statue", "method=2dgs", "preset=smoke", f"method.{part}.enabled=true", "judge=photos")
+    found = graph(*words)
+    assert [step.name for step in found.judge] == ["plain", "judge"]
+    told = [each.why for each in found.moved if each.what == "judged at the end of the run"]
+    assert told
+    assert told[0].startswith(f"method.{part}.enabled learns something of each photo")
+    assert not [each for each in graph(*words, "judge.at=1").moved if each.what == "judged at the end of the run"]
+
+
+@pytest.mark.parametrize("wrong", ["0", "1.5"])
+def test_a_share_that_is_none_is_refused(wrong: str):
+    with pytest.raises(RtgsError, match=f"judge.at={wrong}.* must be above 0, at most 1"):
+        graph(*GLASS, "judge=photos", f"judge.at={wrong}")
+
+
 def test_the_plain_method_has_its_own_numbers_at_the_preset_of_the_run():
     words = ("schedule.total=200", "method.density.max_surfels=123", "judge.every=5", "seed=4")
-    found = graph(*GLASS, "judge=photos", *words)
-    plain, _ = found.judge
+    found = graph(*GLASS, "judge=photos", "judge.at=1", *words)
+    plain, *_ = found.judge
     alone = graph("scene=ball_statue", "method=3dgs", "preset=smoke", "scene.hold_out=5", *words[:1], "seed=4")
     assert plain.recipe == alone.training[0].recipe  # also what a stage of 3dgs reads
     assert plain.params.until == 200
@@ -61,7 +107,7 @@ def test_without_a_judge_nothing_changes():
     assert keys(graph(*GLASS, "judge=none")) == plain
     assert keys(graph(*GLASS, "judge.every=3")) == plain
     judged = keys(graph(*GLASS, "judge=photos"))
-    assert set(judged) - set(plain) == {"plain", "judge"}
+    assert set(judged) - set(plain) == {"plain", "judge", "train_transmittance_rest", "plain_rest"}
     assert not set(judged.values()) & set(plain.values())
     words = ("scene=ball_statue", "method=3dgs", "preset=smoke")
     own = graph(*words, "judge=photos")
@@ -77,6 +123,7 @@ def test_the_page_names_the_judge_only_where_there_is_one():
     assert {key: judged[key] for key in judged.keys() - alone.keys()} == {
         "judge.plain": "3dgs",
         "judge.every": 12,
+        "judge.at": 0.7,
         "scene.hold_out": 0,
     }
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -60,3 +61,13 @@ def test_the_mesh_of_a_stage_makes_what_follows_later(tmp_path: Path, monkeypatc
     text = paths[0].read_text()
     assert "| rtgs, quick | 24.00 |" in text  # after 15 s: the state before the mesh
     assert ("seconds by the wall" in text) == (cpu_seconds is None)
+
+
+def test_what_goes_on_after_a_judge_has_not_waited_for_the_mesh_again(tmp_path: Path):
+    scene = Step("import_scene", 1, ImportParams(SceneSettings(), "x", ""), unrun)
+    mesh = Step("extract_mesh", 1, ImportParams(SceneSettings(), "y", ""), unrun, (scene,))
+    two = stage("transmittance", 20, 26, scene, mesh)
+    rest = replace(two, name="train_transmittance_rest", params=replace(two.params, until=30, joined=26))
+    made = [result(tmp_path / step.name, step) for step in (mesh, two, rest)]
+    waiting = [time_quality._awaited_mesh(stage, made) for stage in made[1:]]
+    assert waiting == [made[0], None]

@@ -18,17 +18,22 @@ from pipelines.steps import judge
 from rtgs.config.names import overridden
 from rtgs.core.cameras import Camera
 from rtgs.core.names import plain_stem
+from rtgs.evaluate.boundary import BoundaryRecord
+from rtgs.evaluate.coverage import FRAMED_BY
 from rtgs.evaluate.images import to_bytes
-from rtgs.evaluate.judgement import JudgeRecord
+from rtgs.evaluate.judgement import JudgeRecord, Verdict, verdict
 from rtgs.evaluate.metrics import psnr
-from rtgs.evaluate.regions import Regions
+from rtgs.evaluate.regions import NOWHERE, Regions, region_errors
 from rtgs.mesh.container import read_object_mesh
+from rtgs.mesh.record import MeshRecord
 from rtgs.runs import mixture
+from rtgs.runs.framing import base_surface, framing_counts
 from rtgs.runs.mixture import PLAIN
-from rtgs.runs.training import OBJECT_FOLDER, load_method
+from rtgs.runs.training import CHECKPOINT_FOLDER, OBJECT_FOLDER, load_method, read_history, stage_params
 from rtgs.runs.views import read_render
 from rtgs.scenes.canonical import read_scene
 from rtgs.scenes.scene import Scene
+from rtgs.train.checkpoint import load_checkpoint
 from rtgs.train.method import Mode
 from rtgs.workflow.manifest import Manifest
 from tests.pipelines.app_cases import QUICK, _in_root, capture, root  # noqa: F401  (fixtures)
@@ -44,8 +49,8 @@ def folders(run: Path) -> dict[str, Path]:
     return {name: run.parents[1] / "store" / name / key[:2] / key for name, key in steps.items()}
 
 
-def plain_image(places: dict[str, Path], scene: Scene, camera: Camera) -> torch.Tensor:
-    method, stage = load_method(places[PLAIN], scene)
+def plain_image(place: Path, scene: Scene, camera: Camera) -> torch.Tensor:
+    method, stage = load_method(place, scene)
     with torch.no_grad():
         return method.render(camera, stage.until, Mode.EVALUATE).image
 
@@ -74,9 +79,11 @@ def test_a_spoilt_object_shows_the_plain_method_to_the_bit(glass):
     assert record.views == tuple(view.name for view in scene.held)
     assert len(scene.held) == 2
     regions = Regions(read_object_mesh(places["train_transmittance"] / OBJECT_FOLDER))
+    scores = [BoundaryRecord.read(places[f"train_transmittance{end}"]) for end in ("", "_rest")]
+    assert str(scores[0].before) == str(scores[1].before)  # where the stage began
     for view in scene.test:
         shown = read_render(places["render"], view.name)
-        plain, full = plain_image(places, scene, view.camera), shown["image_full"]
+        plain, full = plain_image(places["plain_rest"], scene, view.camera), shown["image_full"]
         numbers = regions.numbers(view.camera)
         inside = numbers == 1
         assert 100 < int(inside.sum()) < inside.numel()
@@ -91,21 +98,47 @@ def test_a_spoilt_object_shows_the_plain_method_to_the_bit(glass):
 
 
 def test_the_judge_measures_what_neither_method_was_trained_on(glass):
-    """Its figures are those of the held-out views, rendered with both."""
+    """Its figures are those of the held-out views, rendered with both, where enough training views show the pixels."""
     places = folders(glass[0])
     record = JudgeRecord.read(glass[0])
     scene = read_scene(places["import_scene"])
     regions = Regions(read_object_mesh(places["train_transmittance"] / OBJECT_FOLDER))
     method, stage = load_method(places["train_transmittance"], scene)
-    gains = []
+    surfaces = {view.name: base_surface(method, view.camera, stage.until) for view in scene.held}
+    framed = framing_counts(method, stage.until, scene.held, surfaces, scene.train)
+    gains, pixels = [], 0
     for view in scene.held:
-        inside = regions.numbers(view.camera) == 1
+        inside = (regions.numbers(view.camera) == 1) & (framed[view.name] >= FRAMED_BY)
+        pixels += int(inside.sum())
         with torch.no_grad():
             full = method.render(view.camera, stage.until, Mode.EVALUATE).image
-        plain = plain_image(places, scene, view.camera)
+        plain = plain_image(places[PLAIN], scene, view.camera)
         gains.append(psnr(full, view.image, mask=inside) - psnr(plain, view.image, mask=inside))
     assert record.regions[1].gain == pytest.approx(sum(gains) / len(gains))
     assert sum(gains) < 0
+    assert record.regions[1].pixels == pixels
+
+
+@pytest.mark.parametrize(("left", "judged"), [(0.5, True), (0.0, False)])
+def test_what_too_few_training_views_show_does_not_count(glass, monkeypatch, left: float, judged: bool):
+    """Half of each picture is shown by enough of them, or none of it is."""
+    places = folders(glass[0])
+    scene = read_scene(places["import_scene"])
+
+    def counts(_: object, __: int, views, *___: object) -> dict[str, torch.Tensor]:
+        found = {view.name: torch.full(view.image.shape[1:], FRAMED_BY - 1, dtype=torch.int16) for view in views}
+        for count in found.values():
+            count[:, : round(left * count.shape[1])] = FRAMED_BY
+        return found
+
+    monkeypatch.setattr(judge, "framing_counts", counts)
+    regions = Regions(read_object_mesh(places["train_transmittance"] / OBJECT_FOLDER))
+    for pair, view in zip(judge._pairs(places, scene, regions), scene.held, strict=True):
+        half = round(left * view.image.shape[2])
+        assert torch.equal(pair.numbers[:, :half], regions.numbers(view.camera)[:, :half])
+        assert bool((pair.numbers[:, half:] == NOWHERE).all())
+    found = region_errors(regions.names, judge._pairs(places, scene, regions))
+    assert [verdict(each).gain is not None for each in found] == [judged, judged]
 
 
 def test_both_methods_are_judged_with_the_masks_that_pictures_are_rendered_with(glass, monkeypatch):
@@ -118,6 +151,9 @@ def test_both_methods_are_judged_with_the_masks_that_pictures_are_rendered_with(
         return SimpleNamespace(image=torch.zeros(3, camera.height, camera.width))
 
     monkeypatch.setattr(judge, "load_method", lambda *_: (SimpleNamespace(render=rendered), stage))
+    monkeypatch.setattr(judge, "base_surface", lambda *_: None)
+    framed = {view.name: torch.full(view.image.shape[1:], FRAMED_BY) for view in scene.held}
+    monkeypatch.setattr(judge, "framing_counts", lambda *_: framed)
     regions = Regions(read_object_mesh(places["train_transmittance"] / OBJECT_FOLDER))
     assert len(list(judge._pairs(places, scene, regions))) == len(scene.held) > 0
     shown = [view.mask for view in scene.held for _ in range(2)]
@@ -139,7 +175,7 @@ def test_a_judged_run_says_what_it_shows(glass, capsys, monkeypatch):
     table = json.loads((run / "metrics.json").read_text())
     seconds = [
         json.loads((folders(run)[name] / "summary.json").read_text())["seconds"]
-        for name in ("train_transmittance", PLAIN)
+        for name in ("train_transmittance_rest", "plain_rest")
     ]
     mesh = Manifest.read(folders(run)["extract_mesh"])
     assert mesh is not None
@@ -150,7 +186,8 @@ def test_a_method_that_loses_everywhere_is_not_shown_at_all(capture, root):
     """A scene without glass: the whole picture is the region. An absurd rate of colours spoils the full method."""
     common = [f"scene={capture}", *QUICK]
     spoilt = "method.optimizer.sh_dc=5.0"
-    assert main(["run", *common, "method=rtgs", "judge=photos", spoilt, "method.loss.perceptual=0", "name=lost"]) == 0
+    full = ["method=rtgs", spoilt, "method.loss.perceptual=0", "name=lost"]
+    assert main(["run", *common, *full, "judge=photos", "judge.at=1"]) == 0
     assert main(["run", *common, "method=3dgs", "scene.hold_out=12", "name=plain"]) == 0
     lost, plain = root / "runs" / "lost", root / "runs" / "plain"
     record = JudgeRecord.read(lost)
@@ -163,9 +200,83 @@ def test_a_method_that_loses_everywhere_is_not_shown_at_all(capture, root):
     for figure in ("psnr", "ssim"):
         assert [row["values"][figure] for row in found["views"]] == [row["values"][figure] for row in alone["views"]]
     assert found["facts"]["surfels"] == alone["facts"]["surfels"]
-    assert main(["run", *common, "method=rtgs", spoilt, "method.loss.perceptual=0", "name=lost"]) == 0
+    assert main(["run", *common, *full]) == 0
     assert not (lost / "judge.json").exists()  # another run of this name: nothing is left of it
     assert (lost / "reflection.ply").is_file()
+
+
+def tensors_of(place: Path) -> dict[str, torch.Tensor]:
+    return load_checkpoint(place / CHECKPOINT_FOLDER).tensors
+
+
+def test_what_is_shown_learns_from_the_held_out_views_and_what_is_not_ends(capture, root, capsys):
+    words = [f"scene={capture}", *QUICK, "method=2dgs", "judge=photos", "method.optimizer.sh_dc=5.0", "name=ended"]
+    assert main(["run", *words]) == 0
+    places = folders(root / "runs" / "ended")
+    record = JudgeRecord.read(root / "runs" / "ended")
+    joined = tuple(stage_params(places[name]).joined for name in ("train_diffuse_rest", "plain_rest"))
+    assert (record.all_plain, record.at) == (True, joined)
+    judged, rest = tensors_of(places["train_diffuse"]), tensors_of(places["train_diffuse_rest"])
+    assert judged.keys() == rest.keys()
+    assert all(torch.equal(judged[name], rest[name]) for name in judged)
+    assert read_history(places["train_diffuse_rest"]) == []
+    scene = read_scene(places["import_scene"])
+    count = len(scene.train), len(scene.train) + len(scene.held)
+    orders = [tensors_of(places[name])["views.permutation"] for name in (PLAIN, "plain_rest")]
+    assert tuple(map(len, orders)) == count
+    assert count[0] < count[1]
+    for view in scene.test:
+        shown = read_render(places["render"], view.name)["image"]
+        assert torch.equal(shown, plain_image(places["plain_rest"], scene, view.camera))
+        assert not torch.equal(shown, plain_image(places[PLAIN], scene, view.camera))
+    shown = root / "runs" / "ended" / "point_cloud.ply"
+    assert shown.read_bytes() == (places["plain_rest"] / "base.ply").read_bytes()
+    told = capsys.readouterr().out
+    on = f"held-out views are trained on: the plain 3dgs from step {joined[1]} on: there both were judged"
+    assert f"{len(record.views)} {on}" in told
+    assert f"training stopped: 2dgs from step {joined[0]} on: no region shows it" in told
+    facts = json.loads((root / "runs" / "ended" / "metrics.json").read_text())["facts"]
+    assert facts["steps"] == stage_params(places["plain_rest"]).until
+
+
+def test_a_plain_method_that_is_not_shown_ends_too(capture, root, monkeypatch):
+    """The judge is told that the full method is better."""
+    monkeypatch.setattr(judge, "verdict", lambda errors: Verdict(errors.region, "full"))
+    assert main(["run", f"scene={capture}", *QUICK, "method=2dgs", "judge=photos", "name=kept", "seed=5"]) == 0
+    places = folders(root / "runs" / "kept")
+    judged, rest = tensors_of(places[PLAIN]), tensors_of(places["plain_rest"])
+    assert all(torch.equal(judged[name], rest[name]) for name in judged)
+    trained, gone_on = (
+        tensors_of(places[name])["method.generator"] for name in ("train_diffuse", "train_diffuse_rest")
+    )
+    assert not torch.equal(trained, gone_on)  # density control has drawn from it
+    scene = read_scene(places["import_scene"])
+    view = scene.test[0]
+    assert torch.equal(
+        read_render(places["render"], view.name)["image"],
+        plain_image(places["train_diffuse_rest"], scene, view.camera),
+    )
+
+
+def test_the_rest_of_a_stage_that_has_no_object_is_of_the_stage_before(tmp_path, monkeypatch):
+    """Masks that turn out to be empty: mirrors are trained to the end, on the held-out views as well."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("RTGS_ROOT", str(tmp_path))
+    monkeypatch.setattr(judge, "verdict", lambda errors: Verdict(errors.region, "full"))
+    scene = write_capture(tmp_path / "empty", "empty")
+    words = [f"scene={scene}", "method=rtgs", "masks=given", *JUDGED, *TINY, "method.reflection.matte.probation=0"]
+    assert main(["run", *words, "name=no-object"]) == 0
+    places = folders(tmp_path / "runs" / "no-object")
+    assert MeshRecord.read(places["extract_mesh"]).absent
+    record = JudgeRecord.read(tmp_path / "runs" / "no-object")
+    assert record.at is not None
+    steps = [row["step"] for row in read_history(places["train_transmittance_rest"])]
+    assert not (places["train_transmittance_rest"] / OBJECT_FOLDER).exists()
+    assert min(steps) > record.at[0]
+    assert max(steps) == stage_params(places["train_transmittance_rest"]).until
+    views = read_scene(places["import_scene"])
+    order = tensors_of(places["train_transmittance_rest"])["views.permutation"]
+    assert len(order) == len(views.train) + len(views.held)
 
 
 def test_a_scene_too_small_to_spare_views_keeps_the_full_method(capture, root, capsys):
@@ -184,14 +295,14 @@ def test_a_sweep_merges_judged_jobs_and_the_plain_method_is_not_judged(capture, 
     launcher = ["hydra/launcher=rtgs_dask", "hydra.launcher.workers=1", "hydra.launcher.threads=1"]
     assert main(["run", "--multirun", *words, *launcher]) == 0
     told = capsys.readouterr()
-    assert "2 jobs, 12 steps, " in told.err
+    assert "2 jobs, 14 steps, " in told.err
     assert "no judge step: 3dgs is the plain method itself" in told.err
     named = overridden([*QUICK, "schedule.total=8"])
     assert JudgeRecord.read(root / "runs" / f"tiny_room-2dgs-smoke-judged-{named}").full == "2dgs"
     assert (root / "runs" / f"tiny_room-3dgs-smoke-{named}").is_dir()
     assert not (root / "runs" / f"tiny_room-3dgs-smoke-{named}" / "judge.json").exists()
     assert main(["plan", "--multirun", *words]) == 0
-    assert "12 steps, 12 from the cache, nothing to do" in capsys.readouterr().out
+    assert "14 steps, 14 from the cache, nothing to do" in capsys.readouterr().out
 
 
 def test_runs_without_a_judge_render_as_ever(tmp_path):

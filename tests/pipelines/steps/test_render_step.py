@@ -43,7 +43,8 @@ class CountingMethod:
         return self
 
     def rasterize(self, frame: Frame, wanted: RenderOptions) -> Raster:
-        assert (frame.camera.name, frame.step, frame.mode) == ("2.png", 100, Mode.EVALUATE)
+        assert frame.camera.name in ("2.png", "3.png")  # no test view
+        assert (frame.step, frame.mode) == (100, Mode.EVALUATE)
         assert wanted == RenderOptions(depth=True)
         alpha = torch.full((HEIGHT, WIDTH), self.base_alpha)
         return Raster(RasterBuffers(torch.zeros(3, HEIGHT, WIDTH), alpha, self.base_depth * alpha))
@@ -79,7 +80,8 @@ def context(tmp_path: Path) -> StepContext:
     for name in ("scene", "out", "partial"):
         (tmp_path / name).mkdir()
     views = (view(0, masked=True), view(1, masked=False))
-    scene = Scene("two", (view(2, masked=True),), views, torch.zeros(4, 3), torch.zeros(4, 3), 1.0, "test")
+    train, held = (view(2, masked=True),), (view(3, masked=True),)
+    scene = Scene("two", train, views, torch.zeros(4, 3), torch.zeros(4, 3), 1.0, "test", held=held)
     save_scene(scene, tmp_path / "scene")
     inputs = {"import_scene": tmp_path / "scene", "train_diffuse": tmp_path}
     return StepContext(inputs, tmp_path / "out", tmp_path / "partial", logging.getLogger("test"), NullTracker())
@@ -92,9 +94,11 @@ def run(
     *,
     maps: bool,
     params: render.RenderParams | None = None,
+    joined: int = 0,
 ) -> None:
     monkeypatch.setattr(render, "last_training", lambda inputs: inputs["train_diffuse"])
-    monkeypatch.setattr(render, "load_method", lambda folder, scene: (method, SimpleNamespace(until=100)))
+    stage = SimpleNamespace(until=100, joined=joined)
+    monkeypatch.setattr(render, "load_method", lambda folder, scene: (method, stage))
     render.render(params or render.RenderParams(maps=maps), context)
 
 
@@ -111,6 +115,13 @@ def test_training_views_that_show_a_pixel_are_counted(context, monkeypatch, chan
         assert torch.equal(count, torch.full((HEIGHT, WIDTH), shown, dtype=torch.int16))
         times = render.RenderTimes.read(context.out)
         assert torch.equal(render.read_timed(context.out, times, name).framed, count)
+
+
+def test_held_out_views_count_once_they_were_trained_on(context, monkeypatch) -> None:
+    run(context, CountingMethod(glass=False), monkeypatch, maps=True, joined=70)
+    count = read_coverage(context.out, "0.png")
+    assert count is not None
+    assert bool((count == 2).all())
 
 
 def test_without_maps_nothing_is_counted(context, monkeypatch) -> None:
