@@ -113,7 +113,7 @@ class MeshConfig:
 
 @dataclass(frozen=True)
 class JudgeConfig:
-    """The judge on photos: where the method does not beat a plain one on held-out views, the plain one is shown."""
+    """The judge on photos: where a plain method is better on held-out views, it is shown instead (docs/judge.md)."""
 
     plain: str = ""
     """The plain method, a file of ``conf/method``: it is trained as well, on the same views. Empty: no judge."""

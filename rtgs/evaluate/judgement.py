@@ -64,13 +64,14 @@ class Verdict:
     def figures(self) -> str:
         """Both errors and their difference in words, the kept method's first."""
         if self.gain is None or self.spread is None:
-            return f"{self.views} held-out views show it, {LEAST_VIEWS} are needed: nobody can judge"
+            return f"{self.views} held-out views show enough of it, {LEAST_VIEWS} are needed: nobody can judge"
         assert self.full_error is not None
         assert self.plain_error is not None
         errors = (self.plain_error, self.full_error) if self.kept == "plain" else (self.full_error, self.plain_error)
         text = f"error {errors[0]:.3g} against {errors[1]:.3g} on {self.views} held-out views"
         text += f", {abs(self.gain):.2f} dB with a standard error of {self.spread:.2f}"
-        return text if abs(self.gain) > SURE * self.spread else f"{text}: too close to be sure"
+        sure = self.kept == "plain" or self.gain > SURE * self.spread
+        return text if sure else f"{text}: too close to be sure"
 
 
 def verdict(errors: RegionErrors) -> Verdict:
@@ -80,7 +81,7 @@ def verdict(errors: RegionErrors) -> Verdict:
 
     Views are compared in pairs, for views differ more than methods do, and each counts alike, as in the tables. Where
     too few views show the region the full method stays: there is nothing to judge it by. The doubt is the full one's
-    because both are judged before their ends: its last stage began later and has more to gain (docs/judge.md).
+    because it has more to gain where both are judged before their ends: its last stage began later (docs/judge.md).
     """
     shown = [index for index, count in enumerate(errors.pixels) if count >= LEAST_PIXELS]
     pixels = sum(errors.pixels[index] for index in shown)

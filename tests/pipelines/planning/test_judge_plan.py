@@ -46,7 +46,7 @@ def test_the_plain_method_is_trained_on_the_same_scene_and_the_judge_sees_both()
     assert compose([*GLASS, "judge=photos"])[0].name == "ball_statue-rtgs-smoke-judged"
 
 
-def test_both_are_judged_in_the_last_stage_at_one_share_of_the_run_and_gone_on_with_from_there():
+def test_both_are_judged_in_the_last_stage_at_one_share_of_the_run_and_gone_on_with_from_there(tmp_path: Path):
     found = graph(*GLASS, "judge=photos", "judge.at=0.5", "method.transmittance.start=0.6", "schedule.total=200")
     plain, judge, plain_rest = found.judge
     *_, last, rest = found.training
@@ -55,7 +55,7 @@ def test_both_are_judged_in_the_last_stage_at_one_share_of_the_run_and_gone_on_w
         total = first.params.schedule.total
         assert (first.params.until, first.params.joined) == (total * 4 // 5, 0)
         assert second.params == replace(first.params, until=total, joined=total * 4 // 5)
-    expected = Expectation(Store(Path("nowhere")))
+    expected = Expectation(Store(tmp_path))
     assert expected.seconds(plain_rest) == pytest.approx(expected.seconds(plain) / 4)
 
 

@@ -79,8 +79,6 @@ def test_a_spoilt_object_shows_the_plain_method_to_the_bit(glass):
     assert record.views == tuple(view.name for view in scene.held)
     assert len(scene.held) == 2
     regions = Regions(read_object_mesh(places["train_transmittance"] / OBJECT_FOLDER))
-    scores = [BoundaryRecord.read(places[f"train_transmittance{end}"]) for end in ("", "_rest")]
-    assert str(scores[0].before) == str(scores[1].before)  # where the stage began
     for view in scene.test:
         shown = read_render(places["render"], view.name)
         plain, full = plain_image(places["plain_rest"], scene, view.camera), shown["image_full"]
@@ -258,6 +256,38 @@ def test_a_plain_method_that_is_not_shown_ends_too(capture, root, monkeypatch):
     )
 
 
+def test_a_picture_of_both_methods_is_of_both_as_they_ended(tmp_path, monkeypatch):
+    """The judge is told to show the plain method in the object: both are trained to their ends."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("RTGS_ROOT", str(tmp_path))
+    monkeypatch.setattr(
+        judge, "verdict", lambda errors: Verdict(errors.region, "plain" if errors.region == "the object" else "full")
+    )
+    scene = write_capture(tmp_path / "ball", "ball")
+    assert main(["run", f"scene={scene}", "method=rtgs", *JUDGED, *TINY, "name=both"]) == 0
+    places = folders(tmp_path / "runs" / "both")
+    first, rest = (places[f"train_transmittance{end}"] for end in ("", "_rest"))
+    judged, ended = tensors_of(first), tensors_of(rest)
+    assert len(judged["views.permutation"]) < len(ended["views.permutation"])
+    assert not torch.equal(judged["method.generator"], ended["method.generator"])
+    scores = [BoundaryRecord.read(folder) for folder in (first, rest)]
+    assert scores[0] is not None
+    assert scores[1] is not None
+    assert str(scores[0].before) == str(scores[1].before)  # where the stage began
+    assert str(scores[0].after) != str(scores[1].after)
+    views = read_scene(places["import_scene"])
+    method, stage = load_method(rest, views)
+    regions = Regions(read_object_mesh(rest / OBJECT_FOLDER))
+    for view in views.test:
+        inside = regions.numbers(view.camera) == 1
+        shown = read_render(places["render"], view.name)["image"]
+        with torch.no_grad():
+            full = method.render(view.camera, stage.until, Mode.EVALUATE, mask=view.mask).image
+        plain = plain_image(places["plain_rest"], views, view.camera)
+        assert torch.equal(shown[:, inside], plain[:, inside])
+        assert torch.equal(shown[:, ~inside], full[:, ~inside])
+
+
 def test_the_rest_of_a_stage_that_has_no_object_is_of_the_stage_before(tmp_path, monkeypatch):
     """Masks that turn out to be empty: mirrors are trained to the end, on the held-out views as well."""
     monkeypatch.chdir(tmp_path)
@@ -286,7 +316,7 @@ def test_a_scene_too_small_to_spare_views_keeps_the_full_method(capture, root, c
     assert (record.views, record.replaced) == ((), ())
     told = capsys.readouterr()
     for text in (told.err, told.out):  # the log of the step, and the end of the run
-        assert "kept 2dgs in the picture: 0 held-out views show it, 2 are needed: nobody can judge" in text
+        assert "kept 2dgs in the picture: 0 held-out views show enough of it, 2 are needed: nobody can judge" in text
 
 
 def test_a_sweep_merges_judged_jobs_and_the_plain_method_is_not_judged(capture, root, capsys):
