@@ -108,7 +108,7 @@ def build_graph(config: RunConfig, choices: Choices, inspections: Inspections | 
     judging = judging_of(config, opponent, scene, training, networks)
     judge_steps = () if judging is None else judging.steps
     if judging is not None:
-        training += rest_of(training[-1], config.schedule.total, judging.judge, networks)
+        training += rest_of(training[-1], judging.judge, networks)
     rendered = _rendered(config, scene, *training, *judge_steps)
     measured = evaluate.STEP.step(
         evaluate.EvaluateParams(config.evaluation, row_label(config, choices), choices.preset),

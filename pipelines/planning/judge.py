@@ -109,17 +109,17 @@ def judging_of(
     read = spec.stage(stage.name).reads(replace(method, paper_schedule=ScheduleSettings()))
     whole, own = config.schedule.total, training[-1].params.until
     at = max(round(schedule.total * own / whole), 1)  # the same share of both runs
-    stretch = StageParams(read, schedule, config.seed, stage.name, stage.from_step, min(at, stage.until))
+    stretch = StageParams(read, schedule, config.seed, stage.name, stage.from_step, at)
     plain = train.train_step(spec, stretch, scene, networks=networks, name=PLAIN)
     params = judge.JudgeParams(find_method(config.method.name).name, spec.name, (own, at) if own < whole else None)
     decided = judge.STEP.step(params, scene, *training, plain)
-    return Judging(plain, decided, rest_of(plain, schedule.total, decided, networks))
+    return Judging(plain, decided, rest_of(plain, decided, networks))
 
 
-def rest_of(last: Step, total: int, decided: Step, networks: Named = ()) -> tuple[Step, ...]:
+def rest_of(last: Step, decided: Step, networks: Named) -> tuple[Step, ...]:
     """What goes on with a training after the judge (``decided``); none where it is at its end."""
-    params = last.params
-    if params.until >= total:
+    params, total = last.params, last.params.schedule.total
+    if params.until == total:
         return ()
     rest = replace(params, until=total, joined=params.until)
     spec, upstream = find_method(params.method.name), (*last.upstream, last, decided)

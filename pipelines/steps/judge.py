@@ -31,7 +31,7 @@ def judge(params: JudgeParams, context: StepContext) -> None:
     """Write ``judge.json`` (:class:`rtgs.evaluate.judgement.JudgeRecord`).
 
     Pixels count that at least :data:`rtgs.evaluate.coverage.FRAMED_BY` training views show, by the depth of the full
-    method's base set: of the others both methods know nothing.
+    method's base set: of the others both methods know too little.
     """
     from rtgs.evaluate.regions import region_errors
     from rtgs.scenes.canonical import read_scene

@@ -8,12 +8,16 @@ from pathlib import Path
 import pytest
 
 from pipelines.planning.graph import RunGraph, build_graph, shown_values
+from pipelines.planning.judge import Opponent, until_judged, why_judged_late
 from rtgs.config import compose
 from rtgs.config.compose import compose_plain
 from rtgs.config.schema import Choices
 from rtgs.core.errors import RtgsError
+from rtgs.methods import Stage
+from rtgs.methods.photo_settings import AppearanceSettings
 from rtgs.workflow import Store, topological
-from rtgs.workflow.expectation import Expectation
+from rtgs.workflow.expectation import Expectation, PlanClock
+from rtgs.workflow.plan import Plan, PlannedStep
 
 GLASS = ("scene=ball_statue", "method=rtgs", "preset=smoke")
 
@@ -76,6 +80,27 @@ def test_what_is_learned_of_each_photo_needs_all_of_it(part: str):
     assert told
     assert told[0].startswith(f"method.{part}.enabled learns something of each photo")
     assert not [each for each in graph(*words, "judge.at=1").moved if each.what == "judged at the end of the run"]
+
+
+def test_what_the_plain_method_learns_of_each_photo_needs_all_of_it_too():
+    config, choices = compose([*GLASS, "judge=photos"])
+    opponent = Opponent.of(config, choices)
+    assert opponent is not None
+    stages = (Stage("diffuse", 0, 100),)
+    assert until_judged(config, opponent, stages) == (Stage("diffuse", 0, 70),)
+    learning = replace(opponent, method=replace(opponent.method, appearance=AppearanceSettings(enabled=True)))
+    assert until_judged(config, learning, stages) == stages
+    (told,) = why_judged_late(config, learning)
+    assert told.why.startswith("method=3dgs: method.appearance.enabled learns")
+
+
+def test_a_rest_that_a_judge_drops_says_nothing_of_the_pace(tmp_path: Path):
+    *_, last, rest = graph(*GLASS, "judge=photos").training
+    plan = Plan((PlannedStep(last, False, ""), PlannedStep(rest, False, "")))
+    clock = PlanClock(plan, Expectation(Store(tmp_path)), now=lambda: 0.0)
+    before = clock.left()
+    clock.finish(rest.fingerprint, 0.0)
+    assert clock.left() == pytest.approx(before - clock.weights[rest.fingerprint])
 
 
 @pytest.mark.parametrize("wrong", ["0", "1.5"])
