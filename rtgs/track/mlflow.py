@@ -6,12 +6,13 @@ nor ended, and threads and processes do not share an active run.
 
 from __future__ import annotations
 
+import json
 import logging
+import math
 import os
 import secrets
 import sqlite3
 import time
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
@@ -23,6 +24,7 @@ from filelock import FileLock, Timeout
 from rtgs.core.credentials import hide, redact
 from rtgs.core.errors import RtgsError
 from rtgs.track.failures import ToldClient, failure
+from rtgs.track.mlflow_import import client_class
 from rtgs.track.mlflow_view import KIND_TAG, view_tags
 from rtgs.track.protocol import STEP_TAG, RunInfo, Scalar, Tracker, as_uint8, identity, mark_new
 
@@ -33,6 +35,7 @@ log = logging.getLogger("rtgs.track")
 FINGERPRINT_TAG = "rtgs.fingerprint"
 LOCK_TAG = "rtgs.lock"  # name of the kernel lock that a run holds for as long as its process lives
 PARENT_TAG = "mlflow.parentRunId"  # MLflow's own: its pages fold children under it
+_TABLES_TAG = "mlflow.loggedArtifacts"  # MLflow's own: the tables that its pages offer
 _FLUSH_CALLS = 50  # calls of metrics() between two writes
 _FLUSH_SECONDS = 30.0
 _BATCH_METRICS, _BATCH_PARAMS, _VALUE_LENGTH = 1000, 100, 6000  # limits of MLflow's log_batch
@@ -79,10 +82,16 @@ class MlflowTracker:
             self.client.log_batch(self.run_id, metrics=pending[start : start + _BATCH_METRICS])
 
     def table(self, name: str, rows: Sequence[Mapping[str, Scalar]]) -> None:
-        """``tables/<name>.json``, shown as a table."""
-        if rows:
-            columns = {key: [row.get(key) for row in rows] for key in rows[0]}
-            self.client.log_table(self.run_id, columns, f"tables/{name}.json")
+        """``tables/<name>.json``, shown as a table; what MLflow's own ``log_table`` writes by pandas. One of the same
+        name takes its place."""
+        if not rows:
+            return
+        columns, file = list(rows[0]), f"tables/{name}.json"
+        data = [[_of_json(row.get(key)) for key in columns] for row in rows]
+        self.client.log_dict(self.run_id, {"columns": columns, "data": data}, file)
+        listed = json.loads(self.client.get_run(self.run_id).data.tags.get(_TABLES_TAG, "[]"))
+        if (entry := {"path": file, "type": "table"}) not in listed:
+            self.client.set_tag(self.run_id, _TABLES_TAG, json.dumps([*listed, entry]))
 
     def image(self, name: str, array: np.ndarray, step: int | None = None) -> None:
         """With a step: one stop of the slider of ``name``; without: ``images/<name>.png``."""
@@ -124,16 +133,13 @@ class MlflowTracking:
             RtgsError: the database or server cannot be reached.
         """
         if self._client is None:
-            _quiet()
-            from mlflow.tracking import MlflowClient
-
-            _quiet_logs()
+            make = client_class()
             database = self.database if self.local else None
             try:
                 with FileLock(str(self.root / "mlflow.db.init.lock")):  # two migrations at once kill each other
                     if self.local and not self.database.exists():
                         self._make_database()
-                    client = MlflowClient(tracking_uri=self.uri)
+                    client = make(tracking_uri=self.uri)
                     client.search_experiments(max_results=1)
             except Exception as error:  # of MLflow, SQLAlchemy, SQLite, or the network
                 raise failure(error, self.uri, database) from None
@@ -142,12 +148,10 @@ class MlflowTracking:
 
     def _make_database(self) -> None:
         """Make the tables beside and rename: a kill amid MLflow's migrations leaves a file that it cannot use."""
-        from mlflow.tracking import MlflowClient
-
         fresh = self.database.with_name("mlflow.db.new")
         for left in self.root.glob(f"{fresh.name}*"):  # by a process that was killed here
             left.unlink()
-        MlflowClient(tracking_uri=f"sqlite:///{fresh}").search_experiments(max_results=1)
+        client_class()(tracking_uri=f"sqlite:///{fresh}").search_experiments(max_results=1)
         with closing(sqlite3.connect(fresh)) as connection:
             connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")  # everything into the one file that is renamed
         mark_new(self.database)
@@ -318,17 +322,6 @@ class MlflowTracking:
         return dead
 
 
-def _quiet() -> None:
-    """No telemetry, no network of its own, few retries; set before the first import of MLflow."""
-    os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
-    os.environ.setdefault("DO_NOT_TRACK", "true")
-    os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")
-    os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "2")  # a server that is not there: seconds, not minutes
-
-
-def _quiet_logs() -> None:
-    """No migration chatter; MLflow sets up its own logging when it is imported, so this comes after."""
-    for name in ("alembic", "mlflow", "mlflow.store.db.utils"):
-        logging.getLogger(name).setLevel(logging.WARNING)
-    warnings.filterwarnings("ignore", category=DeprecationWarning, module="mlflow")
-    warnings.filterwarnings("ignore", message=".*select_dtypes.*", module="mlflow")
+def _of_json(value: Scalar) -> Scalar:
+    """JSON has no NaN and no infinity."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value

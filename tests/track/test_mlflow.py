@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import signal
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 from test_track import INFO, log_everything
 
+from rtgs.core.documents import parse_json
 from rtgs.core.errors import RtgsError
 from rtgs.track import RunInfo, open_tracking
 from rtgs.track.mlflow import MlflowTracking
@@ -84,6 +86,45 @@ def test_everything_arrives(tracking, root, tmp_path):
     assert f"{run_id}/artifacts/tables/eval.json" in files
     assert f"{run_id}/artifacts/images/error.png" in files
     assert any("eval" in name and name.endswith(".png") for name in files)
+
+
+def test_a_table_is_what_mlflow_itself_writes(tracking, root):
+    rows = [{"view": "ä", "psnr": float("nan"), "n": 3}, {"view": "b", "psnr": 0.1, "n": None}]
+    with tracking.run(replace(INFO, experiment="rtgs/tables")) as tracker:
+        tracker.table("eval", [{"view": "old", "psnr": 1.0}])
+        tracker.table("empty", [])
+        tracker.table("eval", rows)  # takes the other's place
+        columns = {key: [row[key] for row in rows] for key in rows[0]}
+        tracking.client.log_table(tracker.id, columns, "tables/own.json")
+    (run,) = runs(tracking, "rtgs/tables")
+    folder = root / "mlruns" / run.info.run_id / "artifacts/tables"
+    assert {path.name for path in folder.iterdir()} == {"eval.json", "own.json"}
+    ours, own = (parse_json((folder / name).read_text()) for name in ("eval.json", "own.json"))
+    assert ours == own
+    listed = [{"path": f"tables/{name}.json", "type": "table"} for name in ("eval", "own")]
+    assert json.loads(run.data.tags["mlflow.loggedArtifacts"]) == listed
+
+
+EVERY_CALL = """
+import sys
+from pathlib import Path
+sys.path.insert(0, sys.argv[1])
+from test_track import INFO, log_everything
+from rtgs.track import open_tracking
+root = Path(sys.argv[2])
+tracking = open_tracking("mlflow", root)
+with tracking.run(INFO) as tracker:
+    log_everything(tracker, root)
+print(tracking.finished(INFO.experiment, INFO.fingerprint), sorted({"pandas", "pyarrow"} & set(sys.modules)))
+import pandas, pyarrow
+"""
+
+
+def test_a_run_is_recorded_without_pandas(tmp_path):
+    """It would stay in the process of a training. Who imports it afterwards finds it."""
+    code = [sys.executable, "-c", EVERY_CALL, str(Path(__file__).parent), str(tmp_path)]
+    done = subprocess.run(code, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout.strip()) == (0, "True []"), done.stderr
 
 
 def test_metrics_survive_an_exception(tracking):
