@@ -57,3 +57,15 @@ def test_planning_loads_neither_torch_nor_the_guard():
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"
+
+
+def test_the_plan_of_a_colmap_capture_leaves_pycolmap_out_of_the_process():
+    """It would stay loaded while the run trains."""
+    code = (
+        "import sys; from pipelines.cli.main import main\n"
+        "assert main(['plan', 'scene=demo', f'paths.root={sys.argv[1]}']) == 0\n"
+        "print(sorted(set(sys.modules) & {'torch', 'mlflow', 'pycolmap', 'open3d', 'matplotlib', 'cv2'}))"
+    )
+    command = [sys.executable, "-c", code, "/nowhere"]
+    result = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert result.stdout.splitlines()[-1] == "[]"

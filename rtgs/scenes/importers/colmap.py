@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import os
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from rtgs.core.apart import ProcessDied, apart
 from rtgs.core.names import path_inside, refuse_name
 from rtgs.core.refuse import cut
 from rtgs.scenes.capture import Capture, CaptureView, Finding, PointCloud, existing_side_file, list_some
@@ -53,9 +55,20 @@ def _model_suffix(folder: Path) -> str | None:
 def read_colmap(settings: SceneSettings, root: Path) -> Capture:
     """Read a COLMAP model: poses, lenses, points with colours.
 
+    Where nothing in this process has loaded pycolmap, another one does: its 59 MB would stay for a whole training.
+
     Raises:
         CaptureError: no model, an unreadable one, or one without images.
     """
+    if "pycolmap" in sys.modules:
+        return _read_here(settings, root)
+    try:
+        return apart(_read_here, settings, root)
+    except ProcessDied as error:
+        raise CaptureError(f"the COLMAP model in {root} cannot be read: {error}") from error
+
+
+def _read_here(settings: SceneSettings, root: Path) -> Capture:
     folder = find_model(root, settings.model_dir)
     if folder is None:
         tried = [settings.model_dir] if settings.model_dir else MODEL_FOLDERS
