@@ -22,6 +22,7 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from rtgs.core.credentials import hide, redact
+from rtgs.core.documents import parse_json
 from rtgs.core.errors import RtgsError
 from rtgs.track.failures import ToldClient, failure
 from rtgs.track.mlflow_import import client_class
@@ -89,7 +90,7 @@ class MlflowTracker:
         columns, file = list(rows[0]), f"tables/{name}.json"
         data = [[_of_json(row.get(key)) for key in columns] for row in rows]
         self.client.log_dict(self.run_id, {"columns": columns, "data": data}, file)
-        listed = json.loads(self.client.get_run(self.run_id).data.tags.get(_TABLES_TAG, "[]"))
+        listed = parse_json(self.client.get_run(self.run_id).data.tags.get(_TABLES_TAG, "[]"))
         if (entry := {"path": file, "type": "table"}) not in listed:
             self.client.set_tag(self.run_id, _TABLES_TAG, json.dumps([*listed, entry]))
 
