@@ -15,6 +15,7 @@ from pipelines.planning.plan import describe, remote_store
 from pipelines.planning.sweep import Sweep
 from rtgs.config.schema import Choices, RunConfig
 from rtgs.core.errors import RtgsError
+from rtgs.core.memory import share_one_heap
 from rtgs.core.refuse import refuse_below
 from rtgs.track import Tracking, open_tracking
 from rtgs.workflow import InlineExecutor, Plan, RemoteStore, StepResult, Store, SweepOutcomes, make_plan
@@ -184,6 +185,7 @@ def _process(config: RunConfig | None) -> Iterator[None]:
     if config is None:
         yield
         return
+    share_one_heap()  # before any thread has one
     import torch
 
     from rtgs.native import core

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rtgs.core.documents import DocumentError, parse_json
+from rtgs.core.memory import share_one_heap
 from rtgs.core.records import read_json, record_of, write_json
 from rtgs.runs.mixture import TRAININGS
 from rtgs.runs.training import CHECKPOINT_FOLDER, HISTORY_FILE, OBJECT_FOLDER, StageParams
@@ -44,7 +45,6 @@ def train_stage(params: StageParams, context: StepContext, object_mesh: ObjectMe
     from rtgs.methods import Stage, create_method
     from rtgs.methods.views import views_schedule
     from rtgs.scenes.canonical import read_scene
-    from rtgs.train.memory import share_one_heap
     from rtgs.train.progress import SharedProgress, progress_for
     from rtgs.train.seeds import generator_for
     from rtgs.train.trainer import Trainer

@@ -2,31 +2,20 @@
 
 from __future__ import annotations
 
-import ctypes
-import gc
 import resource
 import sys
 from contextlib import suppress
 from pathlib import Path
 
-REACHES = ()  # of the C library: handing back memory, which changes no result
-_M_ARENA_MAX = -8  # of mallopt(3)
+from rtgs.core.memory import collect_and_hand_back
+
 _STATUS, _RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
-
-
-def share_one_heap() -> None:
-    """Threads allocate from one heap, not each from one of its own that keeps what it frees (glibc; for the whole
-    process). Measured in docs/lab/threads.md: a tenth less memory at no time."""
-    with suppress(OSError, AttributeError):
-        ctypes.CDLL(None).mallopt(_M_ARENA_MAX, 1)
 
 
 def start_peak_memory() -> None:
     """Hand the system what earlier work of the process has freed, and forget the peak so far, each where that is
     possible (glibc; Linux): several trainings of one process are told apart."""
-    gc.collect()
-    with suppress(OSError, AttributeError):
-        ctypes.CDLL(None).malloc_trim(0)
+    collect_and_hand_back()
     with suppress(OSError):
         _RESET.write_text("5")  # proc(5): resets VmHWM
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import torch
 
 from rtgs.core.decisions import Decision
+from rtgs.core.memory import hand_back
 from rtgs.core.version import VERSION
 from rtgs.native import core
 from rtgs.native.threads import SERIAL_PIXELS, serial_torch, threads
@@ -44,6 +45,7 @@ from rtgs.train.watch import Watch, look, why_idle
 
 REPORT_EVERY = 10  # steps between looks at the PSNR of a training view
 RECORD_EVERY = 50  # steps between batches of metrics
+HAND_BACK_EVERY = 50  # steps between times at which freed memory goes back; one costs about a quarter of a step
 
 
 @dataclass(frozen=True)
@@ -257,6 +259,8 @@ class Trainer:
             self.progress.advance(self._report())
         if step % RECORD_EVERY == 0:
             self._flush_metrics()
+        if step % HAND_BACK_EVERY == 0:
+            hand_back()
         every = self.schedule.evaluate_every
         if every and step % every == 0 and self.scene.test:
             with self._off_the_clock():

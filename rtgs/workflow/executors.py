@@ -14,6 +14,7 @@ from typing import Protocol
 from filelock import Timeout
 
 from rtgs.core.credentials import redact
+from rtgs.core.memory import collect_and_hand_back
 from rtgs.core.recipe import flatten
 from rtgs.core.work_time import work_time
 from rtgs.track import NullTracking, RunInfo, Tracking
@@ -194,6 +195,7 @@ class InlineExecutor:
             self.store.drop(attempt)
             if partial.exists() and not any(partial.iterdir()):
                 partial.rmdir()
+            collect_and_hand_back()  # the next step begins with what it needs
 
 
 def _scalar(value: object) -> str | int | float | bool | None:

@@ -1,14 +1,14 @@
 from __future__ import annotations
 
 import platform
-import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
+from training_cases import small_schedule, small_trainer
 
 from rtgs.train.memory import peak_memory_mb, start_peak_memory
+from rtgs.train.trainer import HAND_BACK_EVERY
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux can forget a peak")
@@ -35,29 +35,10 @@ def test_what_earlier_work_has_freed_is_handed_back_first():
     assert last.sum() == 8_000
 
 
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc has heaps for threads")
-@pytest.mark.parametrize(("first", "heaps"), [("share_one_heap()", "1"), ("pass", "more")])
-def test_threads_share_one_heap(first: str, heaps: str, tmp_path: Path):
-    """In a process of its own: it holds for the whole of it."""
-    code = f"""
-import ctypes, threading
-from rtgs.train.memory import share_one_heap
-{first}
-meet = threading.Barrier(3)
-library = ctypes.CDLL(None)
-library.malloc.restype = ctypes.c_void_p
-def allocate():
-    meet.wait()
-    assert library.malloc(5000)
-    meet.wait()
-threads = [threading.Thread(target=allocate) for _ in range(3)]
-[each.start() for each in threads]
-[each.join() for each in threads]
-library.fopen.restype = ctypes.c_void_p
-file = library.fopen({str(tmp_path / "info").encode()!r}, b"w")
-assert library.malloc_info(0, ctypes.c_void_p(file)) == 0
-library.fclose(ctypes.c_void_p(file))
-"""
-    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[2])
-    found = (tmp_path / "info").read_text().count("<heap nr=")
-    assert found == 1 if heaps == "1" else found > 1
+def test_a_training_hands_back_every_so_many_steps(monkeypatch: pytest.MonkeyPatch):
+    """Else the holes that it leaves in the heap add up."""
+    calls: list[int] = []
+    trainer = small_trainer(schedule=small_schedule(2 * HAND_BACK_EVERY + 1))
+    monkeypatch.setattr("rtgs.train.trainer.hand_back", lambda: calls.append(trainer._step))
+    trainer.run()
+    assert calls == [HAND_BACK_EVERY, 2 * HAND_BACK_EVERY]
