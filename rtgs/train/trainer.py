@@ -45,7 +45,7 @@ from rtgs.train.watch import Watch, look, why_idle
 
 REPORT_EVERY = 10  # steps between looks at the PSNR of a training view
 RECORD_EVERY = 50  # steps between batches of metrics
-HAND_BACK_EVERY = 50  # steps between times at which freed memory goes back; one costs about a quarter of a step
+HAND_BACK_EVERY = 50  # steps between times at which freed memory goes back (docs/lab/threads.md, "Memory")
 
 
 @dataclass(frozen=True)
