@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +15,11 @@ from rtgs.core.errors import RtgsError
 from rtgs.core.refuse import refuse_unknown
 from rtgs.mesh.container import ObjectMesh
 from rtgs.mesh.hull import HullResult, carve_hull
+from rtgs.mesh.outlines import Outline, plain_outlines
 from rtgs.mesh.pane import drawn_pane, fit_pane, is_flat
 from rtgs.mesh.record import SurfaceFit
 from rtgs.mesh.settings import MeshSource, ObjectSettings
-from rtgs.mesh.silhouettes import MaskSet, SilhouetteScore, direction_spread, silhouette_score
+from rtgs.mesh.silhouettes import MaskSet, SilhouetteScore, direction_spread, silhouette_scores
 from rtgs.mesh.smoothing import volume
 from rtgs.mesh.surface import find_surface
 from rtgs.mesh.triangles import TriangleMesh, read_mesh_obj, read_mesh_ply
@@ -55,14 +57,30 @@ class _Candidates:
         self.hull: HullResult | None = None
         self.scores: dict[str, float] = {}
         self.fit: SurfaceFit | None = None
+        self._scored: list[tuple[TriangleMesh, tuple[SilhouetteScore, SilhouetteScore]]] = []
+
+    @cached_property
+    def outlines(self) -> list[Outline]:
+        """Of the masks as they are."""
+        return plain_outlines(self.masks.views)
 
     def score(self, mesh: TriangleMesh) -> SilhouetteScore:
         """Where an opaque thing may hide the object, pixels are left out; only a hull knows where."""
-        return silhouette_score(mesh, self.masks.views, self.hull.hidden if self.hull else None)
+        return self.scores_of(mesh)[0]
+
+    def scores_of(self, mesh: TriangleMesh) -> tuple[SilhouetteScore, SilhouetteScore]:
+        """:meth:`score`, and that with all pixels; found once for a mesh."""
+        for known, found in self._scored:
+            if known is mesh:
+                return found
+        found = silhouette_scores(mesh, self.masks.views, self.hull.hidden if self.hull else None)
+        self._scored.append((mesh, found))
+        return found
 
     def carve(self) -> ObjectMesh:
-        """The hull; remembered."""
-        self.hull = hull = carve_hull(self.masks, self.settings.hull)
+        """The hull; remembered. Pixels are left out of scores from now on."""
+        self.hull = hull = carve_hull(self.masks, self.settings.hull, self.outlines)
+        self._scored.clear()
         self.scores["hull"] = self.score(hull.mesh).mean
         if hull.note:
             done = f"hull trimmed to what {hull.trim_views} views see" if hull.trim_views else "hull not trimmed"
@@ -99,7 +117,7 @@ class _Candidates:
 
     def pane(self) -> ObjectMesh:
         """The plane on which the masks agree."""
-        pane = fit_pane(self.masks.views)
+        pane = fit_pane(self.outlines)
         self.scores["pane"] = self.score(pane.mesh).mean
         return ObjectMesh(pane.mesh, "hull", pane.voxel, flat=True)
 
@@ -175,7 +193,7 @@ def choose_object_mesh(
     scores = ", ".join(f"{name} {value:.3f}" for name, value in tried.scores.items())
     what = f"object mesh: {'a flat pane' if mesh.flat else mesh.source}"
     tried.decisions.insert(0, Decision(what, f"mesh.source is {source}; silhouette IoU: {scores}; {about}"))
-    score, plain = tried.score(mesh.mesh), silhouette_score(mesh.mesh, masks.views)
+    score, plain = tried.scores_of(mesh.mesh)
     return Choice(mesh, score, plain, tried.scores, tuple(tried.decisions), tried.hull, tried.fit)
 
 

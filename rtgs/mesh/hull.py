@@ -45,11 +45,18 @@ class HullResult:
     note: str  # why it was not trimmed, or not by mesh.object.hull.trim_views, if so
     pieces: int  # connected ones before the small ones went
     kept: int
-    hidden: tuple[Tensor, ...]  # (H, W) bool for each mask: pixels at which something opaque may hide the object
+    outlines: tuple[Outline, ...]  # of the masks, as it was carved from them
+
+    @property
+    def hidden(self) -> tuple[Tensor, ...]:
+        """(H, W) bool for each mask: pixels at which something opaque may hide the object."""
+        return tuple(outline.hidden for outline in self.outlines)
 
 
-def carve_hull(masks: MaskSet, settings: HullSettings) -> HullResult:
+def carve_hull(masks: MaskSet, settings: HullSettings, known: Sequence[Outline] | None = None) -> HullResult:
     """The visual hull of the masks, smoothed; where the views have depth, trimmed, and not carved by what hides it.
+
+    ``known``: the :func:`plain_outlines` of the masks, where the caller has them.
 
     Raises:
         RtgsError: the masks bound no finite volume, or carve everything away.
@@ -60,25 +67,27 @@ def carve_hull(masks: MaskSet, settings: HullSettings) -> HullResult:
     if not 0 <= most < len(masks.views):
         raise RtgsError(f"mesh.hull.outvoted is {settings.outvoted}, there are {len(masks.views)} usable masks")
     outlines = first_outlines(masks.views)
-    field = MaskField(outlines, settings.min_seen)
+    simple = plain_outlines(masks.views) if known is None else known
+    first, plain = (MaskField(each, settings.min_seen) for each in (outlines, simple))
     center, radius = focus_point(masks.views), _first_radius(masks.views)
-    grid = bounding_grid(field.distance(most), center, radius)
-    if any(view.depth is not None for view in masks.views) and not _explained(field, grid, most, settings):
-        for generous in (len(masks.views) // _GENEROUS, most):
-            rough = _rough_hull(field, grid, generous, settings)
-            if len(rough.faces):
-                field = MaskField(refined_outlines(outlines, rough), settings.min_seen)
-    else:
-        field = MaskField(plain_outlines(masks.views), settings.min_seen)
+    grid = bounding_grid(first.distance(most), center, radius)
+    if all(view.depth is None for view in masks.views):
+        return _carved(plain, grid, most, settings)
+    tried = _best_outvoted(plain, grid, most, settings)
+    if max(tried[1]) >= settings.explained:  # nothing opaque stands before the object, or only in few views
+        return _carved(plain, grid, most, settings, tried)
+    field = first
+    for generous in (len(masks.views) // _GENEROUS, most):
+        rough = _rough_hull(field, grid, generous, settings)
+        if len(rough.faces):
+            field = MaskField(refined_outlines(outlines, rough), settings.min_seen)
     return _carved(field, grid, most, settings)
 
 
-def _explained(field: MaskField, grid: Grid, most: int, settings: HullSettings) -> bool:
-    """The masks alone explain themselves: nothing opaque stands before the object, or only in few views."""
-    plain = MaskField(plain_outlines([item.view for item in field.outlines]), settings.min_seen)
-    trials = _trials(plain, tightened(plain.distance(most), grid), most, settings)
-    _, medians = _choose_outvoted(trials, plain.outlines, settings.tie)
-    return max(medians) >= settings.explained
+def _best_outvoted(field: MaskField, grid: Grid, most: int, settings: HullSettings) -> tuple[int, tuple[float, ...]]:
+    """The k up to ``most`` whose rough hull agrees with most masks, and the median IoU of every one."""
+    trials = _trials(field, tightened(field.distance(most), grid), most, settings)
+    return _choose_outvoted(trials, field.outlines, settings.tie)
 
 
 def _rough_hull(field: MaskField, grid: Grid, outvoted: int, settings: HullSettings) -> TriangleMesh:
@@ -90,11 +99,17 @@ def _rough_hull(field: MaskField, grid: Grid, outvoted: int, settings: HullSetti
     return surface_of_field(values, trial.origin, trial.voxel)
 
 
-def _carved(field: MaskField, grid: Grid, most: int, settings: HullSettings) -> HullResult:
+def _carved(
+    field: MaskField,
+    grid: Grid,
+    most: int,
+    settings: HullSettings,
+    tried: tuple[int, tuple[float, ...]] | None = None,
+) -> HullResult:
+    """``tried``: what :func:`_best_outvoted` says of this field, where that is known."""
     outvoted, medians = most, ()
     if settings.outvoted == AUTOMATIC:
-        trials = _trials(field, tightened(field.distance(most), grid), most, settings)
-        outvoted, medians = _choose_outvoted(trials, field.outlines, settings.tie)
+        outvoted, medians = tried or _best_outvoted(field, grid, most, settings)
     distance = field.distance(outvoted)
     fine = tightened(distance, tightened(distance, grid)).resampled(settings.voxels)
     values, trimmed, needed, note = _trimmed(refined(distance, fine), fine, field.outlines, settings)
@@ -105,8 +120,8 @@ def _carved(field: MaskField, grid: Grid, most: int, settings: HullSettings) -> 
             "object, or poses and masks do not belong together; look at the masks, or raise mesh.hull.outvoted"
         )
     smooth = taubin(mesh, settings.smoothing)
-    hidden = tuple(outline.hidden for outline in field.outlines)
-    return HullResult(smooth, fine.voxel, outvoted, medians, trimmed, needed, note, pieces, kept, hidden)
+    outlines = tuple(field.outlines)
+    return HullResult(smooth, fine.voxel, outvoted, medians, trimmed, needed, note, pieces, kept, outlines)
 
 
 def most_outvoted(views: int) -> int:

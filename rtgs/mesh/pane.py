@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from rtgs.core.errors import RtgsError
-from rtgs.mesh.outlines import HIDDEN, Outline, plain_outlines
+from rtgs.mesh.outlines import HIDDEN, Outline
 from rtgs.mesh.silhouettes import MaskView, focus_point
 from rtgs.mesh.triangles import TriangleMesh
 
@@ -53,13 +53,15 @@ class _Plane:
         return self.center + a[..., None] * self.axes[0] + b[..., None] * self.axes[1]
 
 
-def fit_pane(views: Sequence[MaskView]) -> Pane:
+def fit_pane(outlines: Sequence[Outline]) -> Pane:
     """The plane on which the masks agree best, and the part of it that most of them show.
+
+    ``outlines``: of the masks, :func:`plain_outlines`.
 
     Raises:
         RtgsError: no plane has a point that most masks show.
     """
-    outlines = plain_outlines(views)
+    views = [outline.view for outline in outlines]
     chosen = np.unique(np.linspace(0, len(views) - 1, min(_VIEWS, len(views))).round().astype(int))
     some = [outlines[index] for index in chosen]
     center, half = focus_point(views), _half_size(views)

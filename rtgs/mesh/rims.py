@@ -21,6 +21,7 @@ from rtgs.mesh.guide import MeshGuide
 from rtgs.mesh.operators import MeshShape
 from rtgs.mesh.outlines import signed_distance
 from rtgs.mesh.silhouettes import MaskView
+from rtgs.native.threads import in_threads
 
 _GATE = 3.0  # pixels: a rim farther from the outline is that of another part
 _BORDER = 2  # pixels at the image border, where an outline may be the picture's own
@@ -37,17 +38,26 @@ class RimView:
     usable: np.ndarray  # (H, W) bool: an outline here is the object's
 
 
-def rim_views(views: Sequence[MaskView], hidden: Sequence[Tensor]) -> list[RimView]:
-    """Outlines of the masks; ``hidden`` (H, W) bool for each: pixels at which something opaque may hide the object."""
+def rim_views(
+    views: Sequence[MaskView], hidden: Sequence[Tensor], known: Sequence[Tensor] | None = None
+) -> list[RimView]:
+    """Outlines of the masks.
+
+    Args:
+        views: cameras and masks.
+        hidden: (H, W) bool for each: pixels at which something opaque may hide the object.
+        known: the :func:`signed_distance` (H, W) of mask and hidden pixels for each, where the caller has them.
+    """
     from scipy.ndimage import binary_dilation
 
+    distances = known or in_threads(lambda view, behind: signed_distance((view.mask | behind).numpy()), views, hidden)
     found = []
-    for view, behind in zip(views, hidden, strict=True):
+    for view, behind, distance in zip(views, hidden, distances, strict=True):
         usable = np.zeros(view.mask.shape, bool)
         usable[_BORDER:-_BORDER, _BORDER:-_BORDER] = True
         if behind.any():
             usable &= np.logical_not(binary_dilation(behind.numpy(), iterations=_HIDDEN))
-        found.append(RimView(view.camera, signed_distance((view.mask | behind).numpy()).numpy(), usable))
+        found.append(RimView(view.camera, distance.numpy(), usable))
     return found
 
 

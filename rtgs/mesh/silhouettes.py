@@ -123,16 +123,36 @@ def silhouette_score(
         unknown: (H, W) bool for each view, pixels left out: something opaque may hide the object there.
         stride: every so manieth pixel in both directions only.
     """
+    return silhouette_scores(mesh, views, unknown, stride)[0]
+
+
+def silhouette_scores(
+    mesh: TriangleMesh, views: Sequence[MaskView], unknown: Sequence[Tensor] | None = None, stride: int = 1
+) -> tuple[SilhouetteScore, SilhouetteScore]:
+    """As :func:`silhouette_score`, and the same with the ``unknown`` pixels counted."""
     guide = MeshGuide(mesh, 0.0)
 
-    def share(view: MaskView, hidden: Tensor | None) -> float:
+    def shares(view: MaskView, hidden: Tensor | None) -> tuple[float, float]:
         some = (slice(stride // 2, None, stride),) * 2
         mask, seen = view.mask[some].numpy(), silhouette(guide, view.camera, stride)
-        counted = np.ones_like(mask) if hidden is None else ~hidden[some].numpy()
-        union = np.count_nonzero((seen | mask) & counted)
-        return np.count_nonzero(seen & mask & counted) / union if union else 1.0
+        every = _overlap(seen, mask)
+        if hidden is None:
+            return every, every
+        known = ~hidden[some].numpy()
+        return _overlap(seen & known, mask & known), every
 
-    shares = in_threads(share, views, [None] * len(views) if unknown is None else unknown)
+    found = in_threads(shares, views, [None] * len(views) if unknown is None else unknown)
+    without, every = (_score([pair[k] for pair in found], views) for k in range(2))
+    return without, every
+
+
+def _overlap(seen: np.ndarray, mask: np.ndarray) -> float:
+    """Intersection over union of two pictures (H, W) bool; 1 where both are empty."""
+    union = np.count_nonzero(seen | mask)
+    return np.count_nonzero(seen & mask) / union if union else 1.0
+
+
+def _score(shares: Sequence[float], views: Sequence[MaskView]) -> SilhouetteScore:
     lowest = int(np.argmin(shares))
     return SilhouetteScore(float(np.mean(shares)), shares[lowest], views[lowest].camera.name, tuple(shares))
 

@@ -62,7 +62,7 @@ def find_surface(hull: HullResult, masks: MaskSet, settings: SurfaceSettings, sc
     """The simplest surface that the masks' outlines do not contradict; the hull itself where none costs little enough
     silhouette IoU. Where no one form fits all of the hull, each connected piece is an object with a surface of its own.
     """
-    views = rim_views(masks.views, hull.hidden)
+    views = rim_views(masks.views, hull.hidden, [outline.whole for outline in hull.outlines])
     objects = pieces(hull.mesh)
     whole = _surface_of(hull.mesh, hull.voxel, views, views, settings, score)
     if len(objects) == 1 or whole.kind not in ("free", ""):
