@@ -157,8 +157,8 @@ class MeshGuide:
 
     def meets(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """(R,) bool: the ray crosses the mesh at least once."""
-        answer = self._scene.run(origins.astype(np.float32), directions.astype(np.float32), output=True)
-        return answer["primID"] >= 0
+        rays = (origins.astype(np.float32, copy=False), directions.astype(np.float32, copy=False))
+        return self._scene.run(*rays, query="OCCLUDED") >= 0
 
     def blocked(self, origins: np.ndarray, directions: np.ndarray, reach: float) -> np.ndarray:
         """(R,) bool: something is in front of the origins within ``reach``, in lengths of the directions; one cast,

@@ -21,7 +21,9 @@ from rtgs.mesh.settings import AUTOMATIC, HullSettings
 from rtgs.mesh.silhouettes import MaskSet, MaskView, SilhouetteScore, focus_point, silhouette_score
 from rtgs.mesh.smoothing import main_pieces, surface_of_field, taubin
 from rtgs.mesh.triangles import TriangleMesh
-from rtgs.native.threads import in_threads
+from rtgs.native import core
+from rtgs.native.arrays import arrays_of
+from rtgs.native.threads import in_threads, threads
 
 _FEWEST = 3  # masks
 _MOST_OUTVOTED = 4  # masks: more dilates the hull visibly
@@ -29,7 +31,8 @@ _VIEWS_PER_OUTVOTED = 8  # each costs sharpness: one for so many views
 _TRIAL_VOXELS = 48  # of the hulls among which the automatic k chooses
 _GENEROUS = 4  # the first rough hull lets one view in so many be wrong
 _TRIAL_STRIDE = 3  # pixels
-_PLANES, _POINTS = 64, 2048  # of a convex hull at a time: their products stay in the cache
+_CUBE = 8  # voxels: of points that ask the same planes of a convex hull
+_ROUNDING = 1 + 1e-5  # of normals that are unit to six digits
 
 
 @dataclass(frozen=True)
@@ -231,36 +234,58 @@ def _evidence(values: np.ndarray, grid: Grid, views: Sequence[MaskView], setting
     inside = values > 0
     if not inside.any():
         return "nothing is left of the hull"
-    points = torch.from_numpy(grid.points()[inside])
     free = np.zeros(values.shape, np.int64)
-    for view in deep:
-        free[inside] += _in_front(view, points, settings.trim_margin * grid.voxel)
+    free[inside] = _free_views(deep, grid.points()[inside], settings.trim_margin * grid.voxel)
     evidence = _Evidence(grid, inside, free)
     if evidence.seen(settings.trim_views).sum() < 0.1 * inside.sum():
         return "the base set's depth lies in front of nearly all of the hull"
     return evidence
 
 
-def _in_front(view: MaskView, points: Tensor, margin: float) -> np.ndarray:
-    """(N,) bool: the view shows something transparent at the point's pixel, and the point lies in front of the base
-    set's surface there, or there is none."""
-    at = view.camera.pixels(view.camera.to_camera(points))
-    assert view.depth is not None
-    surface = view.depth.reshape(-1)[at.index].double()
-    free = (surface <= 0) | (at.depth < surface + margin)
-    return (at.framed & view.mask.reshape(-1)[at.index] & free).numpy()
+def _free_views(views: Sequence[MaskView], points: np.ndarray, margin: float) -> np.ndarray:
+    """(N,) int64: how many views show something transparent at a point's pixel, and the point (N, 3) in front of the
+    base set's surface there, or no surface."""
+    free, places = np.empty(len(points), np.int64), np.ascontiguousarray(points, np.float64)
+    core.views_in_front([_depth_view(view) for view in views], places, margin, free, threads())
+    return free
+
+
+def _depth_view(view: MaskView) -> core.DepthView:
+    camera = view.camera
+    lens = (camera.fx, camera.fy, camera.cx, camera.cy)
+    return core.DepthView(*arrays_of(camera.rotation, camera.translation), lens, *arrays_of(view.mask, view.depth))
 
 
 def _convex_distance(points: np.ndarray, centres: np.ndarray, voxel: float) -> np.ndarray:
-    """(N,) distance of points to the convex hull of voxel centres, grown by half a voxel; positive inside."""
+    """(N,) float32 distance of points to the convex hull of voxel centres, grown by half a voxel; positive inside.
+
+    Points of a cube of ``_CUBE`` voxels ask those planes alone that can be the farthest out for one of them.
+    """
     from scipy.spatial import ConvexHull
 
+    if len(points) == 0:
+        return np.empty(0, np.float32)
     planes = np.unique(ConvexHull(centres).equations.round(6), axis=0)
-    some = [planes[first : first + _PLANES] for first in range(0, len(planes), _PLANES)]
+    order, starts = _cubes(points, _CUBE * voxel)
+    places = np.concatenate([points[order].T, np.ones((1, len(points)))])
+    low, high = (each.reduceat(places[:3], starts, axis=1) for each in (np.minimum, np.maximum))
+    reach = _ROUNDING * np.linalg.norm(high - low, axis=0)  # two points of a cube are nowhere farther apart
+    middle = planes[:, :3] @ ((low + high) / 2) + planes[:, 3:]
+    asked = middle >= middle.max(0) - reach
 
-    def outside(part: np.ndarray) -> np.ndarray:
-        places = np.concatenate([part.T, np.ones((1, len(part)))])
-        return np.max([(own @ places).max(0) for own in some], axis=0)
+    def outside(number: int, first: int, last: int) -> np.ndarray:
+        return (planes[asked[:, number]] @ places[:, first:last]).max(0)
 
-    parts = np.array_split(points, max(1, -(-len(points) // _POINTS)))
-    return (0.5 * voxel - np.concatenate(in_threads(outside, parts))).astype(np.float32)
+    ends = [*starts[1:].tolist(), len(points)]
+    farthest = np.empty(len(points))
+    farthest[order] = np.concatenate(in_threads(outside, range(len(starts)), starts.tolist(), ends))
+    return (0.5 * voxel - farthest).astype(np.float32)
+
+
+def _cubes(points: np.ndarray, side: float) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) an order of points that keeps those of a cube together; where each cube begins in it."""
+    cell = np.floor((points - points.min(0)) / side).astype(np.int64)
+    count = cell.max(0) + 1
+    key = (cell[:, 0] * count[1] + cell[:, 1]) * count[2] + cell[:, 2]
+    order = np.argsort(key, kind="stable")
+    return order, np.flatnonzero(np.diff(key[order], prepend=-1))

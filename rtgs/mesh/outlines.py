@@ -10,8 +10,8 @@ contents of a cup) says nothing at all: the cup counts as closed, for its wall i
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -20,12 +20,12 @@ from torch import Tensor
 from rtgs.mesh.guide import MeshGuide
 from rtgs.mesh.silhouettes import MaskView
 from rtgs.mesh.triangles import TriangleMesh
-from rtgs.native.threads import in_threads, serial_torch, threads
+from rtgs.native import core
+from rtgs.native.arrays import arrays_of
+from rtgs.native.threads import in_threads, threads
 
-HIDDEN = 1e9  # instead of a distance: the view says nothing about the point
-_CHUNK = 1 << 16  # points
 _FEWEST = 3  # views that must speak of a point
-_BEHIND = 0.003  # of the depth: how far before the opaque surface a point counts as hidden by it
+_BEHIND = 0.003  # of the depth: how far before the opaque surface a point counts as hidden by it; so has the core
 
 
 @dataclass(frozen=True)
@@ -38,31 +38,14 @@ class Outline:
     whole: Tensor  # (H, W) float32 signed distance to the outline of mask and hidden pixels, pixels, positive inside
     bare: Tensor | None  # the same of the mask alone; None: no pixel is hidden
 
-    def distance(self, points: Tensor) -> Tensor:
-        """(N,) signed distances of (N, 3) points in world units; inf: not in the picture, ``HIDDEN``: not seen."""
-        camera = self.view.camera
-        pixels, depth = camera.project(points)
-        size = torch.tensor([camera.width, camera.height], dtype=points.dtype)
-        framed = (depth > 0) & (pixels >= 0).all(1) & (pixels <= size).all(1)
-        places = torch.where(framed[:, None], 2 * pixels / size - 1, 0.0).float()[None, None]
-        found = _sampled(self.whole, places)
-        silent = torch.zeros(len(points), dtype=torch.bool)
+    @cached_property
+    def native(self) -> core.Outline:
+        """As the kernels take it."""
+        camera, behind = self.view.camera, None
         if self.bare is not None and self.surface is not None:
-            column, row = (pixels[:, k].nan_to_num().clamp(0, size[k].item() - 1).long() for k in (0, 1))
-            index = row * camera.width + column
-            hidden = self.hidden.reshape(-1)[index]
-            free = hidden & (depth <= (1 - _BEHIND) * self.surface.reshape(-1)[index])
-            found = torch.where(free, _sampled(self.bare, places), found)
-            silent = hidden & ~free & (found > 0)
-        scale = depth.float() / (camera.fx * camera.fy) ** 0.5  # world units of a pixel
-        return torch.where(framed, torch.where(silent, HIDDEN, found * scale), torch.inf)
-
-
-def _sampled(picture: Tensor, places: Tensor) -> Tensor:
-    """Bilinear; places (1, 1, N, 2) from -1 to 1 between the image's edges."""
-    return torch.nn.functional.grid_sample(picture[None, None], places, padding_mode="border", align_corners=False)[
-        0, 0, 0
-    ]
+            behind = arrays_of(self.bare, self.surface, self.hidden)
+        lens = (camera.fx, camera.fy, camera.cx, camera.cy)
+        return core.Outline(*arrays_of(camera.rotation, camera.translation), lens, *arrays_of(self.whole), behind)
 
 
 def signed_distance(inside: np.ndarray) -> Tensor:
@@ -95,7 +78,9 @@ def first_outlines(views: Sequence[MaskView]) -> list[Outline]:
 
     def outline(view: MaskView) -> Outline:
         mask = view.mask.numpy()
-        whole = np.asarray(convex_hull_image(mask))
+        box = tuple(slice(used[0], used[-1] + 1) for used in (np.flatnonzero(mask.any(axis)) for axis in (1, 0)))
+        whole = np.zeros_like(mask)
+        whole[box] = convex_hull_image(mask[box])
         return Outline(view, torch.from_numpy(whole & ~mask), None, signed_distance(whole), None)
 
     return in_threads(outline, views)
@@ -147,26 +132,27 @@ class MaskField:
         self.min_seen = max(min(3, len(outlines)), int(np.ceil(min_seen * len(outlines))))
 
     def outvoting(self, points: np.ndarray, counts: Sequence[int]) -> np.ndarray:
-        """(len(counts), N): for every k of ``counts`` the (k+1)-th smallest distance over the views of (N, 3) points.
+        """(len(counts), N) float32: for every k of ``counts`` the (k+1)-th smallest distance over the views of (N, 3)
+        points.
 
         Views that say nothing about a point do not count, and k shrinks with the share of those that do; a point that
         too few have in the picture is outside.
         """
-        chunks = np.array_split(points, max(1, -(-len(points) // _CHUNK)))
-        with ThreadPoolExecutor(threads()) as workers:
-            found = [self._outvoting(torch.from_numpy(chunk), counts, workers) for chunk in chunks]
-        return np.concatenate(found, axis=1)
-
-    def _outvoting(self, points: Tensor, counts: Sequence[int], workers: Executor) -> np.ndarray:
-        with serial_torch():  # which lets go of the interpreter: views in threads
-            values = torch.stack(list(workers.map(lambda outline: outline.distance(points), self.outlines)))
-        smallest = values.topk(max(counts) + 1, dim=0, largest=False, sorted=True).values
-        seen, heard = torch.isfinite(values).sum(0), (values < HIDDEN).sum(0)
-        ranks = [(k * heard) // len(values) for k in counts]
-        result = torch.cat([smallest.gather(0, rank[None]) for rank in ranks])
-        outside = (seen < self.min_seen) | (heard < _FEWEST) | (result >= HIDDEN)
-        return torch.where(outside, -torch.inf, result).numpy()
+        places = np.ascontiguousarray(points, np.float64)
+        result = np.empty((len(counts), len(places)), np.float32)
+        views = [outline.native for outline in self.outlines]
+        core.outvoting(views, places, list(counts), self.min_seen, _FEWEST, result, threads())
+        return result
 
     def distance(self, k: int) -> Callable[[np.ndarray], np.ndarray]:
         """The field for one k: (N, 3) points to (N,) distances."""
         return lambda points: self.outvoting(points, [k])[0]
+
+
+def votes(outlines: Sequence[Outline], points: np.ndarray) -> tuple[Tensor, Tensor]:
+    """(N,) share of the views that show a point of (N, 3) in the mask, soft over a pixel; (N,) views that have it in
+    the picture and say something about it."""
+    places = np.ascontiguousarray(points, np.float64)
+    inside, seen = (np.empty(len(places), np.float32) for _ in range(2))
+    core.outline_votes([outline.native for outline in outlines], places, inside, seen, threads())
+    return torch.from_numpy(inside), torch.from_numpy(seen)

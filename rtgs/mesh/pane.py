@@ -12,10 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from rtgs.core.errors import RtgsError
-from rtgs.mesh.outlines import HIDDEN, Outline
+from rtgs.mesh.outlines import Outline, votes
 from rtgs.mesh.silhouettes import MaskView, focus_point
 from rtgs.mesh.triangles import TriangleMesh
 
@@ -164,25 +163,10 @@ def _plane(center: np.ndarray, normal: np.ndarray, half: float) -> _Plane:
     return _Plane(center, np.stack([u, np.cross(normal, u), normal]), half)
 
 
-def _votes(outlines: Sequence[Outline], points: np.ndarray) -> tuple[Tensor, Tensor]:
-    """(N,) share of the views that show a point in the mask, soft over a pixel; (N,) views that have it in the
-    picture."""
-    flat = torch.from_numpy(points.reshape(-1, 3))
-    inside, seen = torch.zeros(len(flat)), torch.zeros(len(flat))
-    for outline in outlines:
-        camera = outline.view.camera
-        distance = outline.distance(flat)
-        pixel = camera.to_camera(flat)[:, 2].float() / (camera.fx * camera.fy) ** 0.5
-        known = distance < HIDDEN
-        seen += known
-        inside += torch.where(known, (distance / pixel.clamp_min(1e-9) + 0.5).clamp(0, 1), 0.0)
-    return inside / seen.clamp_min(1), seen
-
-
 def _agreements(outlines: Sequence[Outline], planes: Sequence[_Plane], count: int) -> list[float]:
     """Intersection over union, on each plane, of every mask with what most of them show."""
     points = np.stack([plane.points(count) for plane in planes])
-    share, seen = (votes.reshape(len(planes), -1) for votes in _votes(outlines, points))
+    share, seen = (each.reshape(len(planes), -1) for each in votes(outlines, points.reshape(-1, 3)))
     most = share > 0.5
     union = (seen * torch.where(most, 1.0, share)).sum(1)
     common = (seen * share * most).sum(1)
@@ -213,7 +197,7 @@ def _mesh(outlines: Sequence[Outline], plane: _Plane) -> tuple[TriangleMesh, flo
     from skimage.measure import find_contours
 
     step = 2 * plane.half / (_MESH - 1)
-    share, seen = _votes(outlines, plane.points(_MESH))
+    share, seen = votes(outlines, plane.points(_MESH).reshape(-1, 3))
     share = torch.where(seen > 0, share, 0.0).reshape(_MESH, _MESH).numpy()
     contours = find_contours(np.pad(share, 1), 0.5)
     if not contours:

@@ -29,7 +29,8 @@ set(RTGS_KERNELS
   trace/order.cpp
   trace/forward.cpp
   trace/backward.cpp
-  trace/gradients.cpp)
+  trace/gradients.cpp
+  mesh/outlines.cpp)
 set(RTGS_BINDINGS
   bind/module.cpp
   common/isa.cpp
@@ -53,7 +54,8 @@ set(RTGS_BINDINGS
   bind/raster.cpp
   bind/ellipsoids.cpp
   trace/bvh_tree.cpp
-  bind/trace.cpp)
+  bind/trace.cpp
+  bind/outlines.cpp)
 
 set(RTGS_ISAS portable)
 set(RTGS_FLAGS_portable "")
@@ -83,6 +85,10 @@ target_link_options(_core PRIVATE ${RTGS_SANITIZERS})
 if(RTGS_SANITIZE)
   target_compile_definitions(_core PRIVATE RTGS_SANITIZE=1 _GLIBCXX_ASSERTIONS=1)
 endif()
+
+# These round every operation as it is written; the loops are vectorised all the same.
+set_source_files_properties(${RTGS_NATIVE}/mesh/outlines.cpp PROPERTIES COMPILE_OPTIONS
+                            "-fno-fast-math;-ffp-contract=off;-fno-trapping-math;-fno-math-errno")
 
 foreach(isa ${RTGS_ISAS})
   set(objects rtgs_kernels_${isa})

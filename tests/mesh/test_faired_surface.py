@@ -253,8 +253,8 @@ def test_a_mesh_that_masks_contradict_stays() -> None:
 
 def test_where_no_outline_is_known_none_is_told_of() -> None:
     hull, masks = carved(BODIES["sphere"], 24)
-    hidden = replace(hull, hidden=tuple(torch.ones_like(view.mask) for view in masks.views))
-    found = found_of(hidden, masks)
+    hidden = tuple(replace(each, hidden=torch.ones_like(each.hidden)) for each in hull.outlines)
+    found = found_of(replace(hull, outlines=hidden), masks)
     assert found.kind == "free"
     assert (found.fit.outline_before, found.fit.outline, found.fit.contradicted) == (None, None, 1)
     assert "no rim of it is near an outline" in found.decision.why

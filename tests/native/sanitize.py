@@ -29,6 +29,7 @@ TESTS = (
     "tests/methods/test_thread_bits.py",
     "tests/optics/test_light.py",
     "tests/optics/test_walls_native.py",
+    "tests/mesh/test_outlines_native.py",
     "tests/light/test_cube_lookup.py",
     "tests/light/test_feature_network.py",
 )

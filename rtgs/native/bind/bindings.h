@@ -48,6 +48,7 @@ void bind_light(nb::module_& m);
 void bind_features(nb::module_& m);
 void bind_surfels(nb::module_& m);
 void bind_trace(nb::module_& m);
+void bind_outlines(nb::module_& m);
 }  // namespace rtgs
 
 namespace nanobind::detail {

@@ -26,4 +26,5 @@ NB_MODULE(_core, m) {
   rtgs::bind_raster(m);
   rtgs::bind_ellipsoids(m);
   rtgs::bind_trace(m);
+  rtgs::bind_outlines(m);
 }
