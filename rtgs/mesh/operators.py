@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from rtgs.mesh.triangles import TriangleMesh
+from rtgs.mesh.triangles import TriangleMesh, edges_of
 
 _LEAST_WEIGHT, _MOST_WEIGHT = 0.01, 5.0  # of an edge: slivers of marching cubes would have others
 _TINY = 1e-30
@@ -29,8 +29,7 @@ class MeshShape:
         from scipy.sparse import coo_matrix
 
         faces, count = mesh.faces.astype(np.int64), len(mesh.vertices)
-        edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-        edges = np.unique(np.sort(edges, axis=1), axis=0)
+        edges = edges_of(faces, count)
         both = np.concatenate([edges, edges[:, ::-1]])
         adjacency = coo_matrix((np.ones(len(both)), (both[:, 0], both[:, 1])), shape=(count, count)).tocsr()
         return MeshShape(mesh.vertices.astype(np.float64), mesh.faces, edges, adjacency)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rtgs.mesh.pieces import piece_labels, submesh
-from rtgs.mesh.triangles import TriangleMesh
+from rtgs.mesh.triangles import TriangleMesh, edges_of
 
 _TAUBIN = (0.5, -0.53)  # weights of the shrinking and of the growing step (Taubin 1995: pass band 0.1)
 
@@ -49,8 +49,7 @@ def taubin(mesh: TriangleMesh, iterations: int) -> TriangleMesh:
     if iterations == 0 or len(mesh.faces) == 0:
         return mesh
     count = len(mesh.vertices)
-    edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
-    edges = np.unique(np.sort(edges, axis=1), axis=0)
+    edges = edges_of(mesh.faces, count)
     both = np.concatenate([edges, edges[:, ::-1]])
     adjacency = coo_matrix((np.ones(len(both)), (both[:, 0], both[:, 1])), shape=(count, count)).tocsr()
     mean = diags(1 / np.maximum(np.asarray(adjacency.sum(1)).ravel(), 1)) @ adjacency
