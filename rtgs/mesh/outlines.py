@@ -49,15 +49,16 @@ class Outline:
 
 
 def signed_distance(inside: np.ndarray) -> Tensor:
-    """(H, W) float32 distance to the outline, pixels, positive inside. The image border is no outline."""
-    from scipy.ndimage import distance_transform_edt
+    """(H, W) float32 distance to the outline, pixels, positive inside. The image border is no outline.
 
-    if inside.all():
-        return torch.full(inside.shape, float(max(inside.shape)))
-    # Pixel centres are half a pixel from the outline between them and the next pixel.
-    within, beyond = (np.asarray(distance_transform_edt(part)) for part in (inside, ~inside))
-    distance = np.where(inside, within - 0.5, 0.5 - beyond)
-    return torch.from_numpy(distance.astype(np.float32))
+    Pixel centres are half a pixel from the outline between them and the next pixel. A mask (H, W) bool without an
+    outline: as far as the picture is large.
+    """
+    if inside.all() or not inside.any():
+        return torch.full(inside.shape, float(max(inside.shape)) * (1 if inside.all() else -1))
+    distance = np.empty(inside.shape, np.float32)
+    core.outline_distance(np.ascontiguousarray(inside), distance)
+    return torch.from_numpy(distance)
 
 
 def plain_outlines(views: Sequence[MaskView]) -> list[Outline]:

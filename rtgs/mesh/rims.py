@@ -101,19 +101,34 @@ class Rims:
 def find_rims(shape: MeshShape, views: Sequence[RimView], gate: float = _GATE) -> Rims:
     """The rims of a mesh that bound its silhouette, where the masks' outline is near (``gate``, pixels)."""
     guide = MeshGuide(shape.mesh(), 0.0)
-    found = [_rims_of_view(shape, view, index, guide, gate) for index, view in enumerate(views)]
+    normals, edges = shape.normals, np.ascontiguousarray(shape.edges.T)
+
+    def of_view(view: RimView, index: int) -> Rims:
+        return _rims_of_view(shape.vertices, normals, edges, view, index, guide, gate)
+
+    found = in_threads(of_view, views, range(len(views)))
     fields = ("ends", "share", "offset", "pixel", "view")
     return Rims(*(np.concatenate([getattr(item, name) for item in found]) for name in fields))
 
 
-def _rims_of_view(shape: MeshShape, view: RimView, index: int, guide: MeshGuide, gate: float) -> Rims:
-    camera, normals = view.camera, shape.normals
-    centre = camera.center.double().numpy()
-    toward = (normals * (shape.vertices - centre)).sum(1)
-    ends = shape.edges[(toward[shape.edges[:, 0]] < 0) != (toward[shape.edges[:, 1]] < 0)]
+def _rims_of_view(
+    vertices: np.ndarray,
+    normals: np.ndarray,
+    edges: np.ndarray,
+    view: RimView,
+    index: int,
+    guide: MeshGuide,
+    gate: float,
+) -> Rims:
+    """Of one view; vertices and their normals (V, 3), edges (2, E)."""
+    centre = view.camera.center.double().numpy()
+    x, y, z = (normals * (vertices - centre)).T
+    toward = x + y + z
+    facing = toward < 0
+    ends = edges.T[facing[edges[0]] != facing[edges[1]]]
     first, second = toward[ends[:, 0]], toward[ends[:, 1]]
     plain = Rims(ends, first / (first - second), np.zeros(len(ends)), np.ones(len(ends)), np.full(len(ends), index))
-    points, normal = plain.at(shape.vertices), plain.at(normals)
+    points, normal = plain.at(vertices), plain.at(normals)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
     offset, pixel, good = outside(view, points, gate)
     beyond = points + _PAST * pixel[:, None] * normal - centre

@@ -46,7 +46,8 @@ class TriangleMesh:
 def edges_of(faces: np.ndarray, count: int) -> np.ndarray:
     """(E, 2) the edges of faces (F, 3) between ``count`` vertices, each once, ascending; the lower vertex first."""
     ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
-    keys = np.unique(ends.min(1) * count + ends.max(1))
+    keys = np.sort(ends.min(1) * count + ends.max(1))
+    keys = keys[np.diff(keys, prepend=-1) > 0]
     return np.stack(np.divmod(keys, max(count, 1)), axis=1)
 
 

@@ -55,6 +55,7 @@ set(RTGS_BINDINGS
   bind/ellipsoids.cpp
   trace/bvh_tree.cpp
   bind/trace.cpp
+  mesh/distance.cpp
   bind/outlines.cpp)
 
 set(RTGS_ISAS portable)

@@ -8,7 +8,7 @@ import torch
 
 from rtgs.core.cameras import Camera
 from rtgs.mesh.hull import _free_views
-from rtgs.mesh.outlines import MaskField, Outline, votes
+from rtgs.mesh.outlines import MaskField, Outline, signed_distance, votes
 from rtgs.mesh.silhouettes import MaskView
 from rtgs.native import core
 from tests.mesh import outline_twins
@@ -121,3 +121,23 @@ def test_bad_calls_are_refused() -> None:
     with pytest.raises(ValueError, match="translation holds 2 numbers"):
         core.Outline(np.eye(3), np.zeros(2), (1.0, 1.0, 0.0, 0.0), np.zeros((2, 2), np.float32), None)
     assert MaskField(outlines(3), 0.4).outvoting(np.empty((0, 3)), [0]).shape == (1, 0)
+
+
+def test_distances_to_an_outline_are_exact() -> None:
+    draw = np.random.default_rng(11)
+    for height, width, share in (
+        (1, 9, 0.5),
+        (9, 1, 0.5),
+        (40, 23, 0.02),
+        (23, 40, 0.98),
+        (37, 31, 0.5),
+        (64, 64, 1e-3),
+    ):
+        inside = draw.random((height, width)) < share
+        inside[0, 0], inside[-1, -1] = True, False
+        assert np.array_equal(signed_distance(inside).numpy(), outline_twins.signed_distance(inside))
+    inside[:] = True
+    assert (signed_distance(inside) == 64).all()
+    assert (signed_distance(~inside) == -64).all()
+    with pytest.raises(ValueError, match="no outline"):
+        core.outline_distance(inside, np.empty((64, 64), np.float32))

@@ -10,6 +10,7 @@
 #include "bind/bindings.h"
 #include "common/isa.h"
 #include "common/threads.h"
+#include "mesh/distance.h"
 #include "mesh/outlines.h"
 
 namespace rtgs {
@@ -20,6 +21,7 @@ constexpr const char* kName = "outlines";
 using Points = nb::ndarray<const double, nb::c_contig, nb::device::cpu>;
 using Pose = nb::ndarray<const double, nb::c_contig, nb::device::cpu>;
 using Picture = nb::ndarray<const float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+using Mask = nb::ndarray<const bool, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using Counts = nb::ndarray<int64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Flags = nb::ndarray<const bool, nb::c_contig, nb::device::cpu>;
 using Lens = std::tuple<double, double, double, double>;  // fx, fy, cx, cy
@@ -144,12 +146,28 @@ void in_front_of(const std::vector<const NativeDepth*>& depths, Points points, d
   RTGS_DISPATCH(views_in_front, in, out);
 }
 
+void distance_of(Mask inside, Floats distance) {
+  const int64_t height = int64_t(inside.shape(0)), width = int64_t(inside.shape(1)), count = height * width;
+  require(kName, distance, "distance", count);
+  if (count > (1 << 30)) throw std::invalid_argument("outlines: the picture has more than 2^30 pixels");
+  const bool* mask = inside.data();
+  float* out = distance.data();
+  nb::gil_scoped_release release;
+  int64_t covered = 0;
+  for (int64_t p = 0; p < count; ++p) covered += mask[p];
+  if (covered == 0 || covered == count) throw std::invalid_argument("outlines: the mask has no outline");
+  std::vector<int32_t> scratch(size_t(2 * count + 2 * width));
+  outline_distance(height, width, mask, scratch.data(), out);
+}
+
 }  // namespace
 
 void bind_outlines(nb::module_& m) {
   nb::class_<NativeOutline>(m, "Outline", "The mask of one view as distances; see rtgs/mesh/outlines.py.")
       .def(nb::init<Pose, Pose, Lens, Picture, std::optional<Behind>>(), nb::arg("rotation"), nb::arg("translation"),
            nb::arg("lens"), nb::arg("whole"), nb::arg("behind").none());
+  m.def("outline_distance", &distance_of, nb::arg("inside"), nb::arg("distance"),
+        "Fills (H, W) the distance of pixels to the outline of a mask, positive inside, on the calling thread.");
   m.def("outline_distances", &distances_of, nb::arg("outlines"), nb::arg("points").noconvert(), nb::arg("distance"),
         nb::arg("threads"), "Fills the distances (V, N) of points (N, 3) to the outlines of V views, world units.");
   m.def("outvoting", &outvoting_of, nb::arg("outlines"), nb::arg("points").noconvert(), nb::arg("counts"),
