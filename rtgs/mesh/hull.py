@@ -31,7 +31,7 @@ _VIEWS_PER_OUTVOTED = 8  # each costs sharpness: one for so many views
 _TRIAL_VOXELS = 48  # of the hulls among which the automatic k chooses
 _GENEROUS = 4  # the first rough hull lets one view in so many be wrong
 _TRIAL_STRIDE = 3  # pixels
-_CUBE = 8  # voxels: of points that ask the same planes of a convex hull
+_CUBE = 6  # voxels: of points that ask the same planes of a convex hull; products too small for threads of BLAS
 _ROUNDING = 1 + 1e-5  # of normals that are unit to six digits
 
 
