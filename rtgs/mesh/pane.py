@@ -55,7 +55,7 @@ class _Plane:
 def fit_pane(outlines: Sequence[Outline]) -> Pane:
     """The plane on which the masks agree best, and the part of it that most of them show.
 
-    ``outlines``: of the masks, :func:`plain_outlines`.
+    ``outlines``: of the masks, :func:`rtgs.mesh.outlines.plain_outlines`.
 
     Raises:
         RtgsError: no plane has a point that most masks show.
