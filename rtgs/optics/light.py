@@ -17,6 +17,7 @@ from rtgs.native.threads import threads
 
 _DARK_COLOR, _DARK_LIGHT = 0.04045, 0.0031308  # below, both ways are a line of this slope
 _SLOPE, _OFFSET, _POWER = 12.92, 0.055, 2.4
+CLIPPED_FROM = 0.97  # an encoded colour from which on a photo may have cut the light off at 1
 
 
 def decoded(color: Tensor, blend: str) -> Tensor:
@@ -47,6 +48,17 @@ def encoded_twin(light: Tensor) -> Tensor:
     """:func:`encoded` from linear light in plain torch."""
     bright = (1 + _OFFSET) * light.clamp_min(_DARK_LIGHT) ** (1 / _POWER) - _OFFSET
     return torch.where(light <= _DARK_LIGHT, _SLOPE * light, bright)
+
+
+def beyond_the_sensor(color: Tensor, light: float) -> Tensor:
+    """Encoded colours of any shape, where a photo may have cut them off: 1 becomes ``light``, linear, at least 1.
+
+    Below :data:`CLIPPED_FROM` they stay, in between they rise evenly. Where they stand counts as given: there is no
+    gradient from it.
+    """
+    share = ((color.detach() - CLIPPED_FROM) / (1 - CLIPPED_FROM)).clamp(0, 1)
+    most = (1 + _OFFSET) * light ** (1 / _POWER) - _OFFSET
+    return color * (1 + (most - 1) * share)
 
 
 def _filled(kernel: str, *given: Tensor) -> Tensor:

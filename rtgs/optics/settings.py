@@ -88,6 +88,9 @@ class WallSettings:
     # openings, as that of a cup (docs/glass_light.md). 0: all are walls.
     openings: float = field(default=0.0, metadata=UNLESS_DEFAULT)
     opening_gain: float = field(default=0.005, metadata=UNLESS_DEFAULT)  # fall of the squared error there, at least
+    # Linear light behind the object, out of training, where photos show it at their brightest value, 1: they tell only
+    # that it is at least so bright, and what the walls take of it would show. 1: it is just as bright.
+    clipped_light: float = field(default=1.0, metadata=UNLESS_DEFAULT)
     cover: float = 0.9  # a composited k_s from which on a pixel is all glass: what L_spec asks of the interface
 
     def __post_init__(self) -> None:
@@ -106,4 +109,6 @@ class WallSettings:
         )
         key = "method.transmittance.wall.opening_gain"
         refuse_unless(self.opening_gain < 1, key, self.opening_gain, "below 1: no error falls by more")
+        key = "method.transmittance.wall.clipped_light"
+        refuse_unless(self.clipped_light >= 1, key, self.clipped_light, "at least 1, where a photo ends")
         refuse_unless(0 < self.cover <= 1, "method.transmittance.wall.cover", self.cover, "above 0 and at most 1")

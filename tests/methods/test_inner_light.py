@@ -188,12 +188,38 @@ def test_the_index_is_learned_where_it_may_and_goes_on_bit_for_bit(made: GlassSc
         ),
         (lambda: fresnel(index=0.9), r"method\.transmittance\.wall\.index=0\.9 must be between 1\.05 and 2\.5"),
         (lambda: fresnel(bounces=-1), r"method\.transmittance\.wall\.bounces=-1 must be at least 0"),
+        (lambda: fresnel(clipped_light=0.9), r"method\.transmittance\.wall\.clipped_light=0\.9 must be at least 1"),
         (lambda: fresnel(cover=0.0), r"method\.transmittance\.wall\.cover=0\.0 must be above 0"),
     ],
 )
 def test_settings_that_do_not_fit_are_refused(made: Callable[[], object], message: str):
     with pytest.raises(RtgsError, match=message):
         made()
+
+
+@pytest.mark.parametrize(("color", "brighter"), [(1.0, 2.0), (0.8, 1.0)])
+def test_white_behind_the_glass_may_be_brighter_than_photos_show_it(made: GlassScene, color: float, brighter: float):
+    """The walls take of it, and it stays white; what is darker is seen as before."""
+    behind = []
+    for light in (1.0, 2.0):
+        method = begun(fresnel(clipped_light=light), made)
+        base, contents = method["base"].gaussians, method["transmittance"].gaussians
+        with torch.no_grad():
+            base.sh_dc.fill_((color - 0.5) / 0.28209479)
+            base.sh_rest.zero_()
+            base.opacity_logits.fill_(9.0)
+            base.log_scales.fill_(-0.5)  # no gaps
+            contents.opacity_logits.fill_(-9.0)
+        found = shown(method, made)
+        assert found.layers is not None
+        behind.append(decoded(found.layers["transmitted_color"], "linear")[:, found.maps["transparent"]])
+    plain = behind[0]
+    assert float(plain.max()) > 0.8 * float(decoded(torch.tensor(color), "linear"))
+    filled = plain > 0.9 * plain.max()  # but where the wall lets less pass
+    ratio = behind[1][filled] / plain[filled]
+    assert float(ratio.median()) == pytest.approx(brighter, rel=0.02)
+    assert float(ratio.min()) > 0.999, "no light is lost"
+    assert float(ratio.max()) < 1.02 * brighter
 
 
 def test_a_sensor_stops_at_its_brightest_value_and_nowhere_else():

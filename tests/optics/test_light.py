@@ -6,7 +6,7 @@ import torch
 
 from rtgs.methods.shading.mirror import specular_change
 from rtgs.native import core
-from rtgs.optics.light import decoded, decoded_twin, encoded, encoded_twin
+from rtgs.optics.light import CLIPPED_FROM, beyond_the_sensor, decoded, decoded_twin, encoded, encoded_twin
 from rtgs.scenes.truth import srgb_from_linear
 
 
@@ -23,6 +23,20 @@ def test_gradients_are_finite_and_right_at_black_and_beyond_white():
     color = torch.tensor([0.0, 1e-3, 0.03, 0.06, 0.5, 1.7], dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda c: decoded(c, "linear"), color)
     assert torch.autograd.gradcheck(lambda c: encoded(c, "linear"), color)
+
+
+def test_what_a_photo_cut_off_gets_the_light_that_is_asked_for_and_nothing_else_does():
+    color = torch.tensor([0.0, 0.5, CLIPPED_FROM, 0.985, 1.0, 1.2], dtype=torch.float64, requires_grad=True)
+    found = beyond_the_sensor(color, 2.0)
+    torch.testing.assert_close(found[:3], color[:3])
+    light = decoded(found.detach(), "linear")
+    assert float(light[4]) == pytest.approx(2.0)
+    assert float(light[5] / decoded(color[5].detach(), "linear")) == pytest.approx(2.0, rel=0.05)
+    assert 1.0 < float(light[3]) < 2.0
+    found.sum().backward()
+    assert color.grad is not None
+    torch.testing.assert_close(color.grad, (found / color).detach().nan_to_num(1.0))  # no slope of where it begins
+    assert torch.equal(beyond_the_sensor(color, 1.0), color)
 
 
 def test_a_half_mirror_of_white_over_black_is_half_the_light():

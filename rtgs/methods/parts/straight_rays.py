@@ -18,7 +18,7 @@ from rtgs.methods.settings import MethodSettings
 from rtgs.methods.shading.far_wall import Behind, seen_through
 from rtgs.methods.shading.inner import LINEAR, TracedLeg, inner_light
 from rtgs.methods.shading.straight import FirstBounce, GlassRays, Transmission
-from rtgs.optics.light import decoded
+from rtgs.optics.light import beyond_the_sensor, decoded
 from rtgs.render.buffers import TraceBuffers, TraceOptions
 from rtgs.train.method import Observation, RenderOptions
 
@@ -90,6 +90,7 @@ class StraightRays:
         color, parts = first.colors, {}
         if self._goes_on:
             rows, behind = self._behind(rays if onward is None else onward, first, degree)
+            behind = behind if frame.training or wall is None else self._uncut(behind)
             over = self.settings.transmittance.compositing == "over"
             if wall is None:
                 color = color.index_add(0, rows, (1 - first.alpha)[rows, None] * behind if over else behind)
@@ -106,6 +107,12 @@ class StraightRays:
         """There is a second bounce. A pane has no back surface, and what begins at the first bounce asks for none."""
         bounce = self.settings.transmittance.second_bounce
         return bounce == "first_bounce" or (bounce == "mesh" and not self.mesh.flat)
+
+    def _uncut(self, behind: Tensor) -> Tensor:
+        """Colours (B, 3) behind a wall, with the light that photos of them cut off. Not in training, where photos taken
+        through the glass teach what they need."""
+        light = self.settings.transmittance.wall.clipped_light
+        return beyond_the_sensor(behind, light) if light > 1 else behind
 
     def _met(self, rows: Tensor, color: Tensor, wall: FarWall) -> Behind:
         """What lies behind the contents: the ``color`` (B, 3) that ``rows`` meet, and the light from inside."""
