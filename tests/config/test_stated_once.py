@@ -102,7 +102,7 @@ def test_no_ablation_restates_what_its_methods_have(ablation):
 def test_glass_has_the_numbers_of_the_schema():
     """rtgs alone reads them: with its published preset they are the dataclass's own, but for the light of its walls."""
     config, _ = compose(["scene=demo", "method=rtgs", "preset=paper"])
-    walls = WallSettings(light="fresnel", openings=0.25)
+    walls = WallSettings(light="fresnel", openings=0.25, clipped_light=1.5)
     beyond = TransmittanceSettings(normal="mesh", start_opacity=0.1, contents="rasterized", rim_samples=16, wall=walls)
     beyond = replace(beyond, density=replace(beyond.density, gradient_threshold=2e-4))
     assert config.method.transmittance == beyond
