@@ -15,6 +15,7 @@ from tests.mesh import outline_twins
 from tests.mesh.shapes import camera_at
 
 COUNTS = (0, 1, 4)
+LENS = (1.0, 1.0, 0.0, 0.0)  # of a camera that is asked nothing
 
 
 def outlines(views: int = 12) -> list[Outline]:
@@ -111,16 +112,72 @@ def test_threads_places_and_instruction_sets_change_no_bit(isa: str) -> None:
 
 
 def test_bad_calls_are_refused() -> None:
-    every, points = [each.native for each in outlines(3)], places(5)
+    every, points, numbers = [each.native for each in outlines(3)], places(5), np.empty(5, np.float32)
     with pytest.raises(ValueError, match="k is 3 of 3"):
         core.outvoting(every, points, [3], 1, 1, np.empty((1, 5), np.float32), 1)
-    with pytest.raises(ValueError, match="distance holds 4 numbers, expected 5"):
-        core.outvoting(every, points, [0], 1, 1, np.empty(4, np.float32), 1)
     with pytest.raises(ValueError, match="there are no views"):
-        core.outline_votes([], points, np.empty(5, np.float32), np.empty(5, np.float32), 1)
+        core.outline_votes([], points, numbers, numbers, 1)
+    with pytest.raises(ValueError, match="outlines holds None"):
+        core.outline_votes([every[0], None], points, numbers, numbers, 1)
+    with pytest.raises(ValueError, match="depths holds None"):
+        core.views_in_front([None], points, 0.1, np.empty(5, np.int64), 1)
     with pytest.raises(ValueError, match="translation holds 2 numbers"):
-        core.Outline(np.eye(3), np.zeros(2), (1.0, 1.0, 0.0, 0.0), np.zeros((2, 2), np.float32), None)
+        core.Outline(np.eye(3), np.zeros(2), LENS, np.zeros((2, 2), np.float32), None)
     assert MaskField(outlines(3), 0.4).outvoting(np.empty((0, 3)), [0]).shape == (1, 0)
+
+
+def test_shapes_that_hold_as_many_numbers_are_refused() -> None:
+    every, votes, free = [each.native for each in outlines(3)], np.empty((2, 5), np.float32), np.empty(5, np.int64)
+    depth = core.DepthView(np.eye(3), np.zeros(3), LENS, np.ones((2, 2), bool), np.ones((2, 2), np.float32))
+    for shape, found in (((3, 5), r"\(3, 5\)"), ((15,), r"\(15\)"), ((5, 3, 1), r"\(5, 3, 1\)")):
+        points, refused = places(5).reshape(shape), rf"points is {found}, expected \(N, 3\)"
+        with pytest.raises(ValueError, match=refused):
+            core.outline_votes(every, points, *votes, 1)
+        with pytest.raises(ValueError, match=refused):
+            core.views_in_front([depth], points, 0.1, free, 1)
+    with pytest.raises(ValueError, match=r"distance is \(5, 3\), expected \(3, 5\)"):
+        core.outline_distances(every, places(5), np.empty((5, 3), np.float32), 1)
+    with pytest.raises(ValueError, match=r"distance is \(4\), expected \(1, 5\)"):
+        core.outvoting(every, places(5), [0], 1, 1, np.empty(4, np.float32), 1)
+    with pytest.raises(ValueError, match=r"distance is \(3, 2\), expected \(2, 3\)"):
+        core.outline_distance(np.eye(2, 3, dtype=bool), np.empty((3, 2), np.float32))
+
+
+@pytest.mark.parametrize("name", ["bare", "surface", "hidden"])
+def test_pictures_of_an_outline_have_the_same_sides(name: str) -> None:
+    kinds = {"bare": np.float32, "surface": np.float32, "hidden": np.bool_}
+    behind = [np.zeros((3, 2) if each == name else (2, 3), kind) for each, kind in kinds.items()]
+    with pytest.raises(ValueError, match=rf"{name} is \(3, 2\), expected \(2, 3\)"):
+        core.Outline(np.eye(3), np.zeros(3), LENS, np.zeros((2, 3), np.float32), behind)
+
+
+def test_a_mask_has_the_sides_of_its_depth() -> None:
+    with pytest.raises(ValueError, match=r"mask is \(3, 2\), expected \(2, 3\)"):
+        core.DepthView(np.eye(3), np.zeros(3), LENS, np.zeros((3, 2), bool), np.zeros((2, 3), np.float32))
+
+
+@pytest.mark.parametrize("shape", [(1, 2**24 + 1), (2**24 + 1, 1), (0, 4), (4, 0)])
+def test_sides_that_kernels_cannot_count_are_refused(shape: tuple[int, int]) -> None:
+    """Zeros that nothing reads take no memory."""
+    picture, mask, pose = np.zeros(shape, np.float32), np.zeros(shape, bool), (np.eye(3), np.zeros(3), LENS)
+    refused = rf"a picture of \({shape[0]}, {shape[1]}\); sides of 1 to 2\^24 pixels"
+    with pytest.raises(ValueError, match=refused):
+        core.Outline(*pose, picture, None)
+    with pytest.raises(ValueError, match=refused):
+        core.DepthView(*pose, mask, picture)
+    with pytest.raises(ValueError, match=refused):
+        core.outline_distance(mask, picture)
+
+
+def test_the_widest_picture_is_read_to_its_last_pixel() -> None:
+    """Beside the last pixel of a picture of 2^24 in a row lies nothing that is read."""
+    width = 2**24
+    picture = np.zeros((1, width), np.float32)
+    picture[0, -1] = 3
+    widest = core.Outline(np.eye(3), np.zeros(3), (1.0, 1.0, 0.0, 0.0), picture, None)
+    found = np.empty((1, 2), np.float32)
+    core.outline_distances([widest], np.array([[width, 0.5, 1.0], [0.0, 0.5, 1.0]]), found, 1)
+    assert found.tolist() == [[3.0, 0.0]]
 
 
 def test_distances_to_an_outline_are_exact() -> None:

@@ -4,6 +4,7 @@
 
 #include <cmath>
 #include <optional>
+#include <string>
 #include <tuple>
 #include <vector>
 
@@ -23,20 +24,45 @@ using Pose = nb::ndarray<const double, nb::c_contig, nb::device::cpu>;
 using Picture = nb::ndarray<const float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using Mask = nb::ndarray<const bool, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using Counts = nb::ndarray<int64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
-using Flags = nb::ndarray<const bool, nb::c_contig, nb::device::cpu>;
 using Lens = std::tuple<double, double, double, double>;  // fx, fy, cx, cy
-using Behind = std::tuple<Picture, Picture, Flags>;       // bare, surface, hidden
+using Behind = std::tuple<Picture, Picture, Mask>;        // bare, surface, hidden
 
-Pinhole pinhole_of(const Pose& rotation, const Pose& translation, const Lens& lens, size_t height, size_t width) {
+constexpr int64_t kMostOfSide = 1 << 24;  // pixels: places are float32, which would round past the last one above it
+constexpr int64_t kMostPixels = 1 << 30;  // their indices are int32
+
+template <typename Array>
+std::string shape_of(const Array& a) {
+  std::string found;
+  for (size_t k = 0; k < a.ndim(); ++k) found += (k ? ", " : "") + std::to_string(a.shape(k));
+  return "(" + found + ")";
+}
+
+// An array that is not (rows, columns) is a ValueError: as many numbers in another shape are others.
+template <typename Array>
+void require_shape(const Array& a, const char* name, int64_t rows, int64_t columns) {
+  if (a.ndim() == 2 && int64_t(a.shape(0)) == rows && int64_t(a.shape(1)) == columns) return;
+  throw std::invalid_argument("outlines: " + std::string(name) + " is " + shape_of(a) + ", expected (" +
+                              std::to_string(rows) + ", " + std::to_string(columns) + ")");
+}
+
+// Checks the sides of a picture, which are then height and width.
+template <typename Array>
+std::tuple<int64_t, int64_t> sides_of(const Array& picture) {
+  const int64_t height = int64_t(picture.shape(0)), width = int64_t(picture.shape(1));
+  if (height < 1 || width < 1 || height > kMostOfSide || width > kMostOfSide || height * width > kMostPixels)
+    throw std::invalid_argument("outlines: a picture of " + shape_of(picture) +
+                                "; sides of 1 to 2^24 pixels and 2^30 pixels in all are possible");
+  return {height, width};
+}
+
+Pinhole pinhole_of(const Pose& rotation, const Pose& translation, const Lens& lens, int64_t height, int64_t width) {
   require(kName, rotation, "rotation", 9);
   require(kName, translation, "translation", 3);
-  if (height < 1 || width < 1 || height * width > (1 << 30))
-    throw std::invalid_argument("outlines: the picture has no pixel, or more than 2^30");
   Pinhole camera{};
   for (int k = 0; k < 9; ++k) camera.rotation[k] = rotation.data()[k];
   for (int k = 0; k < 3; ++k) camera.translation[k] = translation.data()[k];
   std::tie(camera.fx, camera.fy, camera.cx, camera.cy) = lens;
-  camera.width = int64_t(width), camera.height = int64_t(height);
+  camera.width = width, camera.height = height;
   return camera;
 }
 
@@ -45,13 +71,15 @@ class NativeOutline {
  public:
   NativeOutline(Pose rotation, Pose translation, Lens lens, Picture whole, std::optional<Behind> behind)
       : whole_(whole), behind_(behind) {
-    view_.camera = pinhole_of(rotation, translation, lens, whole.shape(0), whole.shape(1));
+    const auto [height, width] = sides_of(whole);
+    view_.camera = pinhole_of(rotation, translation, lens, height, width);
     view_.focal = float(std::sqrt(view_.camera.fx * view_.camera.fy));
     view_.whole = whole_.data();
     if (!behind_) return;
     const auto& [bare, surface, hidden] = *behind_;
-    for (const Picture* each : {&bare, &surface}) require(kName, *each, "a picture", int64_t(whole.size()));
-    require(kName, hidden, "hidden", int64_t(whole.size()));
+    require_shape(bare, "bare", height, width);
+    require_shape(surface, "surface", height, width);
+    require_shape(hidden, "hidden", height, width);
     view_.bare = bare.data(), view_.surface = surface.data(), view_.hidden = hidden.data();
   }
   const OutlineView& view() const { return view_; }
@@ -65,37 +93,42 @@ class NativeOutline {
 // The mask and the depth of one view; keeps them alive.
 class NativeDepth {
  public:
-  NativeDepth(Pose rotation, Pose translation, Lens lens, Flags mask, Picture depth) : mask_(mask), depth_(depth) {
-    require(kName, mask, "mask", int64_t(depth.size()));
-    view_ = {pinhole_of(rotation, translation, lens, depth.shape(0), depth.shape(1)), mask_.data(), depth_.data()};
+  NativeDepth(Pose rotation, Pose translation, Lens lens, Mask mask, Picture depth) : mask_(mask), depth_(depth) {
+    const auto [height, width] = sides_of(depth);
+    require_shape(mask, "mask", height, width);
+    view_ = {pinhole_of(rotation, translation, lens, height, width), mask_.data(), depth_.data()};
   }
   const DepthView& view() const { return view_; }
 
  private:
-  Flags mask_;
+  Mask mask_;
   Picture depth_;
   DepthView view_{};
 };
 
 SpacePoints checked_points(const Points& points, int threads) {
-  const int64_t count = int64_t(points.size()) / 3;
-  require(kName, points, "points", 3 * count);
-  return {count, points.data(), checked_threads(threads)};
+  if (points.ndim() != 2 || points.shape(1) != 3)
+    throw std::invalid_argument("outlines: points is " + shape_of(points) + ", expected (N, 3)");
+  return {int64_t(points.shape(0)), points.data(), checked_threads(threads)};
 }
 
-// The views side by side, as kernels take them.
+// The views of argument `name` side by side, as kernels take them.
 template <typename Row, typename Native>
-std::vector<Row> rows_of(const std::vector<const Native*>& views) {
+std::vector<Row> rows_of(const std::vector<const Native*>& views, const char* name) {
   if (views.empty()) throw std::invalid_argument("outlines: there are no views");
   std::vector<Row> rows;
-  for (const Native* each : views) rows.push_back(each->view());
+  for (const Native* each : views) {
+    if (!each) throw std::invalid_argument("outlines: " + std::string(name) + " holds None");
+    rows.push_back(each->view());
+  }
   return rows;
 }
 
 using Outlines = std::vector<const NativeOutline*>;
 
 struct Views {
-  Views(const Outlines& outlines, const Points& points, int threads) : rows(rows_of<OutlineView>(outlines)) {
+  Views(const Outlines& outlines, const Points& points, int threads)
+      : rows(rows_of<OutlineView>(outlines, "outlines")) {
     in = {checked_points(points, threads), int64_t(rows.size()), rows.data()};
   }
   std::vector<OutlineView> rows;
@@ -104,7 +137,7 @@ struct Views {
 
 void distances_of(const Outlines& outlines, Points points, Floats distance, int threads) {
   const Views views(outlines, points, threads);
-  require(kName, distance, "distance", views.in.views * views.in.in.count);
+  require_shape(distance, "distance", views.in.views, views.in.in.count);
   float* out = distance.data();
   nb::gil_scoped_release release;
   RTGS_DISPATCH(outline_distances, views.in, out);
@@ -113,7 +146,7 @@ void distances_of(const Outlines& outlines, Points points, Floats distance, int 
 void outvoting_of(const Outlines& outlines, Points points, const std::vector<int64_t>& counts, int64_t min_seen,
                   int64_t min_heard, Floats distance, int threads) {
   const Views views(outlines, points, threads);
-  require(kName, distance, "distance", int64_t(counts.size()) * views.in.in.count);
+  require_shape(distance, "distance", int64_t(counts.size()), views.in.in.count);
   int64_t most = 0;
   for (const int64_t k : counts) {
     if (k < 0 || k >= views.in.views)
@@ -138,7 +171,7 @@ void votes_of(const Outlines& outlines, Points points, Floats inside, Floats see
 
 void in_front_of(const std::vector<const NativeDepth*>& depths, Points points, double margin, Counts views,
                  int threads) {
-  const std::vector<DepthView> rows = rows_of<DepthView>(depths);
+  const std::vector<DepthView> rows = rows_of<DepthView>(depths, "depths");
   const DepthPoints in = {checked_points(points, threads), int64_t(rows.size()), rows.data(), margin};
   require(kName, views, "views", in.in.count);
   int64_t* out = views.data();
@@ -147,9 +180,9 @@ void in_front_of(const std::vector<const NativeDepth*>& depths, Points points, d
 }
 
 void distance_of(Mask inside, Floats distance) {
-  const int64_t height = int64_t(inside.shape(0)), width = int64_t(inside.shape(1)), count = height * width;
-  require(kName, distance, "distance", count);
-  if (count > (1 << 30)) throw std::invalid_argument("outlines: the picture has more than 2^30 pixels");
+  const auto [height, width] = sides_of(inside);
+  const int64_t count = height * width;
+  require_shape(distance, "distance", height, width);
   const bool* mask = inside.data();
   float* out = distance.data();
   nb::gil_scoped_release release;
@@ -177,7 +210,7 @@ void bind_outlines(nb::module_& m) {
         nb::arg("seen"), nb::arg("threads"),
         "Fills (N,) the share of the views that show a point in the mask, and how many have it in the picture.");
   nb::class_<NativeDepth>(m, "DepthView", "Mask and z-depth of one view; see rtgs/mesh/hull.py.")
-      .def(nb::init<Pose, Pose, Lens, Flags, Picture>(), nb::arg("rotation"), nb::arg("translation"), nb::arg("lens"),
+      .def(nb::init<Pose, Pose, Lens, Mask, Picture>(), nb::arg("rotation"), nb::arg("translation"), nb::arg("lens"),
            nb::arg("mask"), nb::arg("depth"));
   m.def("views_in_front", &in_front_of, nb::arg("depths"), nb::arg("points").noconvert(), nb::arg("margin"),
         nb::arg("views").noconvert(), nb::arg("threads"),

@@ -11,7 +11,7 @@ constexpr float kUnseen = 1e9f;  // instead of a distance: the view says nothing
 struct Pinhole {
   double rotation[9], translation[3];  // world to camera
   double fx, fy, cx, cy;
-  int64_t width, height;  // of the picture, 2^30 pixels at most
+  int64_t width, height;  // of the picture, 2^24 at most, and 2^30 pixels in all
 };
 
 struct OutlineView {
