@@ -7,7 +7,7 @@ smallest over the views instead of the smallest, so that k broken masks carve no
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,6 +32,7 @@ _TRIAL_VOXELS = 48  # of the hulls among which the automatic k chooses
 _GENEROUS = 4  # the first rough hull lets one view in so many be wrong
 _TRIAL_STRIDE = 3  # pixels
 _CUBE = 6  # voxels: of points that ask the same planes of a convex hull; products too small for threads of BLAS
+_PRODUCTS = 1 << 22  # of planes with cubes at a time: 32 MB
 _ROUNDING = 1 + 1e-5  # of normals that are unit to six digits
 
 
@@ -268,18 +269,30 @@ def _convex_distance(points: np.ndarray, centres: np.ndarray, voxel: float) -> n
     planes = np.unique(ConvexHull(centres).equations.round(6), axis=0)
     order, starts = _cubes(points, _CUBE * voxel)
     places = np.concatenate([points[order].T, np.ones((1, len(points)))])
-    low, high = (each.reduceat(places[:3], starts, axis=1) for each in (np.minimum, np.maximum))
-    reach = _ROUNDING * np.linalg.norm(high - low, axis=0)  # two points of a cube are nowhere farther apart
-    middle = planes[:, :3] @ ((low + high) / 2) + planes[:, 3:]
-    asked = middle >= middle.max(0) - reach
-
-    def outside(number: int, first: int, last: int) -> np.ndarray:
-        return (planes[asked[:, number]] @ places[:, first:last]).max(0)
-
     ends = [*starts[1:].tolist(), len(points)]
+
+    def outside(asked: np.ndarray, first: int, last: int) -> np.ndarray:
+        return (planes[asked] @ places[:, first:last]).max(0)
+
+    found = []
+    for some, asked in _asked_planes(planes, places[:3], starts):
+        found += in_threads(outside, asked.T, starts[some].tolist(), ends[some])
     farthest = np.empty(len(points))
-    farthest[order] = np.concatenate(in_threads(outside, range(len(starts)), starts.tolist(), ends))
+    farthest[order] = np.concatenate(found)
     return (0.5 * voxel - farthest).astype(np.float32)
+
+
+def _asked_planes(planes: np.ndarray, places: np.ndarray, starts: np.ndarray) -> Iterator[tuple[slice, np.ndarray]]:
+    """Some cubes, and which of the (P, 4) planes can be the farthest out for a point of each: (P, cubes) bool; so many
+    cubes at a time as bound the memory. ``places`` (3, N): cube by cube from ``starts`` on."""
+    low, high = (each.reduceat(places, starts, axis=1) for each in (np.minimum, np.maximum))
+    reach = _ROUNDING * np.linalg.norm(high - low, axis=0)  # two points of a cube are nowhere farther apart
+    centre, count = (low + high) / 2, max(1, _PRODUCTS // len(planes))
+    for first in range(0, len(starts), count):
+        some = slice(first, first + count)
+        middle = planes[:, :3] @ centre[:, some]
+        middle += planes[:, 3:]
+        yield some, middle >= middle.max(0) - reach[some]
 
 
 def _cubes(points: np.ndarray, side: float) -> tuple[np.ndarray, np.ndarray]:

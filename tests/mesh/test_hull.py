@@ -12,7 +12,7 @@ from rtgs.core.cameras import Camera
 from rtgs.core.errors import RtgsError
 from rtgs.mesh.container import ObjectMesh
 from rtgs.mesh.guide import MeshGuide
-from rtgs.mesh.hull import _convex_distance, carve_hull, most_outvoted
+from rtgs.mesh.hull import _asked_planes, _convex_distance, _cubes, carve_hull, most_outvoted
 from rtgs.mesh.outlines import plain_outlines
 from rtgs.mesh.pane import _agreements, _plane
 from rtgs.mesh.score import hit_score, mesh_distance, triangle_distance
@@ -255,6 +255,20 @@ def test_distance_to_a_convex_hull_is_that_to_the_nearest_of_its_planes(count: i
     found = _convex_distance(points, centres, 0.1)
     assert found.dtype == np.float32
     np.testing.assert_allclose(found, 0.05 - outside.max(1), rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("products", [1, 5000])
+def test_cubes_at_a_time_change_no_bit_of_a_distance(products: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    generator = np.random.default_rng(7)
+    centres, points = generator.normal(size=(400, 3)), 2 * generator.normal(size=(3000, 3))
+    whole = _convex_distance(points, centres, 0.1)
+    monkeypatch.setattr("rtgs.mesh.hull._PRODUCTS", products)
+    assert np.array_equal(_convex_distance(points, centres, 0.1), whole)
+    order, starts = _cubes(points, 0.6)
+    planes = generator.normal(size=(100, 4))
+    counts = [asked.shape[1] for _, asked in _asked_planes(planes, points[order].T, starts)]
+    assert sum(counts) == len(starts) > 100
+    assert max(counts) == max(1, products // 100)
 
 
 def test_threads_find_the_same_hull_and_scores() -> None:
