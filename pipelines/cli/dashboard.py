@@ -11,6 +11,7 @@ from pipelines.cli.termination import serve_until_interrupted
 from pipelines.steps.report import PAGE as REPORT
 from rtgs.core.errors import RtgsError
 from rtgs.track.mlflow import PARENT_TAG, MlflowTracking
+from rtgs.track.mlflow_import import pandas_left_out
 from rtgs.track.mlflow_view import SORTED_BY, artifact_link, view_link
 from rtgs.workflow.executors import STEPS_EXPERIMENT
 
@@ -24,6 +25,7 @@ Artifacts has tables/eval.json with every test view, report.html the page, point
 key. The parent run of a sweep holds tables/figures.json, and of an experiment with a table table.html."""
 
 
+@pandas_left_out()
 def serve(root: Path, port: int) -> int:
     """Print what to look at, and serve until Ctrl-C; returns the exit code.
 

@@ -40,6 +40,7 @@ from rtgs.config.schema import register_schema
 from rtgs.config.words import friendly_overrides
 from rtgs.core.credentials import redact
 from rtgs.core.errors import RtgsError
+from rtgs.track.mlflow_import import pandas_left_out
 from rtgs.workflow import Plan, SweepOutcomes
 
 log = logging.getLogger("rtgs")
@@ -64,6 +65,7 @@ class HydraApp:
         self.outcomes: list[RunOutcome] = []
         self.failures: list[str] = []
 
+    @pandas_left_out()  # again: a launcher's process has not come through run_hydra
     def __call__(self, composed: DictConfig) -> None:
         """One job, here or in a process that a launcher started."""
         self._job(composed, SweepOutcomes({}))
@@ -113,6 +115,7 @@ class HydraApp:
         return "\n\n".join(part for part in parts if part)
 
 
+@pandas_left_out()
 def run_hydra(words: Sequence[str]) -> HydraApp:
     """Compose and run, or print what an option of Hydra asks for; returns the app with what its jobs gave.
 

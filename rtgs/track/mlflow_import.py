@@ -1,7 +1,13 @@
-"""MLflow's client as a run has it in its process: quiet, and without libraries that it can do without.
+"""MLflow's client: quiet, and in a command's own process without libraries that it can do without.
 
 ``import mlflow`` loads pandas and pyarrow where they are installed, 74 MB that would stay for a whole training. Its
-small distribution, mlflow-skinny, does without either.
+small distribution, mlflow-skinny, does without either. So the command line has it imported as if they were not there
+(:func:`pandas_left_out`); everybody else, a notebook that uses rtgs as a library or a worker of a sweep, gets the plain
+import.
+
+The limit: a process that has imported MLflow without the two stays without what MLflow builds on them
+(``mlflow.pyfunc``, ``mlflow.pytorch``, ``mlflow.models.infer_signature``), and a thread that imports pandas at that
+very moment finds none. Pandas itself can be imported before and afterwards.
 """
 
 from __future__ import annotations
@@ -12,18 +18,33 @@ import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from mlflow.tracking import MlflowClient
 
 LEFT_OUT = ("pandas", "pyarrow")
+_OWN_PROCESS = ContextVar("rtgs_own_process", default=False)  # of this thread only: others keep the plain import
+
+
+@contextmanager
+def pandas_left_out() -> Iterator[None]:
+    """For commands that own their process: a first import of MLflow while this is open leaves pandas and pyarrow out.
+
+    What the module says of its limit then holds for the rest of the process.
+    """
+    before = _OWN_PROCESS.set(True)
+    try:
+        yield
+    finally:
+        _OWN_PROCESS.reset(before)
 
 
 def client_class() -> type[MlflowClient]:
     """The class, with the first import of MLflow."""
     _quiet()
-    with _left_out(LEFT_OUT):
+    with _left_out(LEFT_OUT if _OWN_PROCESS.get() else ()):
         from mlflow.tracking import MlflowClient
     _quiet_logs()
     return MlflowClient
@@ -31,7 +52,8 @@ def client_class() -> type[MlflowClient]:
 
 @contextmanager
 def _left_out(names: tuple[str, ...]) -> Iterator[None]:
-    """While the block runs, an import of these finds nothing, unless they are loaded already."""
+    """While the block runs, an import of these finds nothing, unless they are loaded already. A module that somebody
+    puts in the place meanwhile stays."""
     hidden = [name for name in names if name not in sys.modules]
     for name in hidden:
         sys.modules[name] = None  # type: ignore[assignment]  # what Python's import takes for "there is none"
@@ -39,7 +61,8 @@ def _left_out(names: tuple[str, ...]) -> Iterator[None]:
         yield
     finally:
         for name in hidden:
-            del sys.modules[name]
+            if sys.modules.get(name, name) is None:
+                del sys.modules[name]
 
 
 def _quiet() -> None:

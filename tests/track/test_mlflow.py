@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import importlib
 import json
 import signal
 import subprocess
@@ -7,6 +8,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 from test_track import INFO, log_everything
@@ -15,6 +17,7 @@ from rtgs.core.documents import parse_json
 from rtgs.core.errors import RtgsError
 from rtgs.track import RunInfo, open_tracking
 from rtgs.track.mlflow import MlflowTracking
+from rtgs.track.mlflow_import import _left_out
 
 WRITER = """
 import sys, time
@@ -106,25 +109,57 @@ def test_a_table_is_what_mlflow_itself_writes(tracking, root):
 
 
 EVERY_CALL = """
-import sys
+import contextlib, sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[1])
 from test_track import INFO, log_everything
 from rtgs.track import open_tracking
+from rtgs.track.mlflow_import import pandas_left_out
 root = Path(sys.argv[2])
-tracking = open_tracking("mlflow", root)
-with tracking.run(INFO) as tracker:
-    log_everything(tracker, root)
-print(tracking.finished(INFO.experiment, INFO.fingerprint), sorted({"pandas", "pyarrow"} & set(sys.modules)))
+with {around}:
+    tracking = open_tracking("mlflow", root)
+    with tracking.run(INFO) as tracker:
+        log_everything(tracker, root)
+    print(tracking.finished(INFO.experiment, INFO.fingerprint), sorted({{"pandas", "pyarrow"}} & set(sys.modules)))
 import pandas, pyarrow
+assert pandas.DataFrame({{"a": [1, 2]}})["a"].sum() == 3
+"""
+AFTERWARDS = """
+import mlflow.pyfunc
+from mlflow.models import infer_signature
+assert infer_signature(pandas.DataFrame({"a": [1, 2]})).inputs.input_names() == ["a"]
 """
 
 
-def test_a_run_is_recorded_without_pandas(tmp_path):
+def every_call(folder: Path, code: str) -> str:
+    command = [sys.executable, "-c", code, str(Path(__file__).parent), str(folder)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+def test_a_command_records_without_pandas(tmp_path):
     """It would stay in the process of a training. Who imports it afterwards finds it."""
-    code = [sys.executable, "-c", EVERY_CALL, str(Path(__file__).parent), str(tmp_path)]
-    done = subprocess.run(code, capture_output=True, text=True, timeout=120)
-    assert (done.returncode, done.stdout.strip()) == (0, "True []"), done.stderr
+    assert every_call(tmp_path, EVERY_CALL.format(around="pandas_left_out()")) == "True []"
+
+
+def test_who_uses_the_library_has_the_whole_of_mlflow_afterwards(tmp_path):
+    code = EVERY_CALL.format(around="contextlib.nullcontext()") + AFTERWARDS
+    assert every_call(tmp_path, code) == "True ['pandas', 'pyarrow']"
+
+
+def test_what_others_put_in_the_place_of_a_library_left_out_stays():
+    names = ("rtgs_absent", "rtgs_replaced", "rtgs_popped")
+    real = ModuleType("rtgs_replaced")
+    try:
+        with _left_out(names):
+            with pytest.raises(ImportError):
+                importlib.import_module("rtgs_absent")
+            sys.modules["rtgs_replaced"] = real
+            del sys.modules["rtgs_popped"]
+        assert [sys.modules.get(name, "none") for name in names] == ["none", real, "none"]
+    finally:
+        sys.modules.pop("rtgs_replaced", None)
 
 
 def test_metrics_survive_an_exception(tracking):

@@ -260,11 +260,14 @@ def test_the_module_is_the_same_as_the_command(first, words):
     assert "nothing to do" in result.stderr
 
 
-def slow_modules(words: list[str]) -> str:
+SLOW = frozenset({"torch", "mlflow", "distributed", "cv2", "skimage", "scipy"})
+
+
+def slow_modules(words: list[str], watched: frozenset[str] = SLOW) -> str:
     """Which of the modules that take long to import a command loads."""
     code = (
         "import sys; from pipelines.cli.main import main; assert main(sys.argv[1:]) == 0; "
-        "print('loaded', sorted({'torch', 'mlflow', 'distributed', 'cv2', 'skimage', 'scipy'} & set(sys.modules)))"
+        f"print('loaded', sorted({set(watched)!r} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=True)
     return done.stdout.splitlines()[-1]
@@ -278,6 +281,14 @@ def test_planning_loads_nothing_that_takes_seconds():
 def test_a_run_that_is_all_there_is_shown_again_in_seconds(first, words, sweep):
     assert main([*words, *sweep]) == 0
     assert slow_modules([*words, *sweep]) == "loaded []"
+
+
+@pytest.mark.parametrize("sweep", [[], ["--multirun", "table.name=recorded"]])
+def test_a_run_is_recorded_in_mlflow_without_pandas(first, words, sweep, tmp_path):
+    """It would stay in the process for as long as the run trains."""
+    recorded = [word if word != "tracking=off" else "tracking=mlflow" for word in [*words, *sweep]]
+    recorded += [f"tracking.uri=sqlite:///{tmp_path}/mlflow.db", f"name={tmp_path.name}"]
+    assert slow_modules(recorded, frozenset({"mlflow", "pandas", "pyarrow"})) == "loaded ['mlflow']"
 
 
 STOPS_AT_A_CHECKPOINT = """
