@@ -4,22 +4,31 @@ from __future__ import annotations
 
 import os
 import pickle
-import signal
+import shutil
 import subprocess
 import sys
 import traceback
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import IO, Any, TypeVar
 
 from rtgs.core.errors import RtgsError
 
 REACHES = ()  # the function is imported by whoever names it
 Result = TypeVar("Result")
-_CHILD = "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); from rtgs.core.apart import serve; serve()"
+_ANSWER = b"rtgs answers\n"  # comes first: another program than Python may say anything
+# Without a request the one who asked has been interrupted: nothing to do, and nothing to say.
+_CHILD = """
+import io, pickle, sys
+request = io.BytesIO(sys.stdin.buffer.read())
+if request.getbuffer():
+    sys.path[:] = pickle.load(request)
+    from rtgs.core.apart import serve
+    serve(request)
+"""
 
 
 class ProcessDied(RtgsError):
-    """It ended without a result."""
+    """It did not start, or ended without a result."""
 
 
 class RaisedThere(Exception):
@@ -30,15 +39,15 @@ def apart(function: Callable[..., Result], *arguments: object) -> Result:
     """``function(*arguments)`` in a new Python process, which is gone afterwards.
 
     The function is found by its module and name, arguments and result are pickled. What it prints goes to stderr. An
-    interrupt ends the process with this call.
+    interrupt, or whatever else a signal raises in this thread, ends the process with this call.
 
     Raises:
         Exception: what the function raised, with a :class:`RaisedThere` as its cause.
-        ProcessDied: with the exit code; negative: of the signal.
+        ProcessDied: it did not start, ended without an answer, or with an exit code; negative: of the signal.
     """
+    name = f"the process of {function.__module__}.{function.__qualname__}"
     request = pickle.dumps(sys.path) + pickle.dumps((function, arguments))
-    pipe = subprocess.PIPE
-    with subprocess.Popen([sys.executable, "-P", "-c", _CHILD], stdin=pipe, stdout=pipe) as process:
+    with _started(name) as process:
         try:
             found, _ = process.communicate(request)
         except BaseException:
@@ -46,21 +55,38 @@ def apart(function: Callable[..., Result], *arguments: object) -> Result:
             process.wait()
             raise
     if process.returncode != 0:
-        name = f"{function.__module__}.{function.__qualname__}"
-        raise ProcessDied(f"the process of {name} died with exit code {process.returncode}")
-    value, error, trace = pickle.loads(found)
+        raise ProcessDied(f"{name} died with exit code {process.returncode}")
+    if not found.startswith(_ANSWER):
+        raise ProcessDied(f"{name} gave no answer: is {sys.executable} a Python interpreter?")
+    value, error, trace = pickle.loads(found[len(_ANSWER) :])
     if error is None:
         return value
     raise error from RaisedThere(f"\n{trace}")
 
 
-def serve() -> None:
+def has_interpreter() -> bool:
+    """Whether this process knows a program to start: embedded in another one, Python may have no ``sys.executable``."""
+    return bool(sys.executable) and shutil.which(sys.executable) is not None
+
+
+def _started(name: str) -> subprocess.Popen[bytes]:
+    """The new process, not yet asked. Its session is its own: Ctrl-C in a terminal reaches only who started it, who
+    ends it, and it may print to that terminal."""
+    if not sys.executable:
+        raise ProcessDied(f"{name} cannot start: this Python does not know its interpreter (sys.executable)")
+    command, pipe = [sys.executable, "-P", "-c", _CHILD], subprocess.PIPE
+    try:
+        return subprocess.Popen(command, stdin=pipe, stdout=pipe, start_new_session=True)
+    except OSError as error:
+        raise ProcessDied(f"{name} cannot start {sys.executable}: {error.strerror}") from error
+
+
+def serve(request: IO[bytes]) -> None:
     """What the new process does: one call, its answer to the stdout that it was started with."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends Ctrl-C to both; who started this one ends it
-    function, arguments = pickle.load(sys.stdin.buffer)
+    function, arguments = pickle.load(request)
     with os.fdopen(os.dup(1), "wb") as answer:
         os.dup2(2, 1)  # libraries print, and that must not come between
-        answer.write(_answer(function, arguments))
+        answer.write(_ANSWER + _answer(function, arguments))
 
 
 def _answer(function: Callable[..., object], arguments: tuple[object, ...]) -> bytes:

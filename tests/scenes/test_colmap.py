@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -120,6 +122,31 @@ def test_long_side_and_ratio_average_areas(tmp_path):
     torch.testing.assert_close(quarter.image, torch.nn.functional.avg_pool2d(full.image, 4), atol=1e-6, rtol=0)
     assert half.camera.cx == pytest.approx(PINHOLE[2] / 2)
     assert load(root, long_side=500).train[0].camera.width == WIDTH
+
+
+ITSELF = """
+import sys
+from pathlib import Path
+from rtgs.scenes.importers.colmap import read_colmap
+from rtgs.scenes.settings import CaptureError, SceneSettings
+sys.executable = sys.argv[2]
+try:
+    print(len(read_colmap(SceneSettings(path=sys.argv[1]), Path(sys.argv[1])).views), "pycolmap" in sys.modules)
+except CaptureError as error:
+    print(error)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="names of programs")
+@pytest.mark.parametrize(
+    ("interpreter", "said"), [("", "10 True"), ("/", "10 True"), (shutil.which("true"), "cannot be read: the process")]
+)
+def test_a_python_without_an_interpreter_to_start_reads_the_model_itself(tmp_path, interpreter, said):
+    """In another program; one that is there but is no Python is told."""
+    command = [sys.executable, "-c", ITSELF, str(ColmapCapture(tmp_path).write()), interpreter]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert said in done.stdout
 
 
 def test_track_length_filter_uses_the_model(tmp_path):

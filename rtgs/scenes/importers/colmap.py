@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from rtgs.core.apart import ProcessDied, apart
+from rtgs.core.apart import ProcessDied, apart, has_interpreter
 from rtgs.core.names import path_inside, refuse_name
 from rtgs.core.refuse import cut
 from rtgs.scenes.capture import Capture, CaptureView, Finding, PointCloud, existing_side_file, list_some
@@ -60,7 +60,7 @@ def read_colmap(settings: SceneSettings, root: Path) -> Capture:
     Raises:
         CaptureError: no model, an unreadable one, or one without images.
     """
-    if "pycolmap" in sys.modules:
+    if "pycolmap" in sys.modules or not has_interpreter():  # the other process saves memory, and nothing else
         return _read_here(settings, root)
     try:
         return apart(_read_here, settings, root)
