@@ -84,11 +84,15 @@ class MlflowTracker:
 
     def table(self, name: str, rows: Sequence[Mapping[str, Scalar]]) -> None:
         """``tables/<name>.json``, shown as a table; what MLflow's own ``log_table`` writes by pandas. One of the same
-        name takes its place."""
+        name takes its place.
+
+        Raises:
+            TypeError: a value is no text, number or None, nor a scalar of NumPy that is one.
+        """
         if not rows:
             return
         columns, file = list(rows[0]), f"tables/{name}.json"
-        data = [[_of_json(row.get(key)) for key in columns] for row in rows]
+        data = [[_of_json(row.get(key), f"table {name}, column {key}") for key in columns] for row in rows]
         self.client.log_dict(self.run_id, {"columns": columns, "data": data}, file)
         listed = parse_json(self.client.get_run(self.run_id).data.tags.get(_TABLES_TAG, "[]"))
         if (entry := {"path": file, "type": "table"}) not in listed:
@@ -323,6 +327,11 @@ class MlflowTracking:
         return dead
 
 
-def _of_json(value: Scalar) -> Scalar:
-    """JSON has no NaN and no infinity."""
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+def _of_json(value: object, place: str) -> Scalar:
+    """JSON has no NaN and no infinity. What else it lacks MLflow would write as text, without a word."""
+    found = value.item() if isinstance(value, np.generic) else value
+    if isinstance(found, float) and not math.isfinite(found):
+        return None
+    if found is None or isinstance(found, str | int | float):
+        return found
+    raise TypeError(f"{place}: {value!r} of type {type(value).__name__} is no text, number or None")

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pytest
 from test_track import INFO, log_everything
 
@@ -106,6 +107,25 @@ def test_a_table_is_what_mlflow_itself_writes(tracking, root):
     assert ours == own
     listed = [{"path": f"tables/{name}.json", "type": "table"} for name in ("eval", "own")]
     assert json.loads(run.data.tags["mlflow.loggedArtifacts"]) == listed
+
+
+def test_numbers_of_numpy_are_numbers_in_a_table_and_what_is_no_scalar_is_refused(tracking, root):
+    numbers = {"f32": np.float32(1.5), "f64": np.float64(0.1), "i": np.int64(3), "b": np.bool_(True)}
+    others = {"nan": np.float32("nan"), "inf": np.float64("inf"), "s": np.str_("ä")}
+    refused = [Path("a"), np.zeros(2), np.datetime64("2020-01-01"), 1j, [1]]
+    with tracking.run(replace(INFO, experiment="rtgs/numpy")) as tracker:
+        tracker.table("eval", [numbers | others])
+        columns = {key: [value] for key, value in (numbers | others).items()}
+        tracking.client.log_table(tracker.id, columns, "tables/own.json")
+        for value in refused:
+            with pytest.raises(TypeError, match=rf"table odd, column x: .* of type {type(value).__name__} is no text"):
+                tracker.table("odd", [{"x": 1.0}, {"x": value}])
+    (run,) = runs(tracking, "rtgs/numpy")
+    folder = root / "mlruns" / run.info.run_id / "artifacts/tables"
+    assert {path.name for path in folder.iterdir()} == {"eval.json", "own.json"}
+    ours, own = (parse_json((folder / name).read_text()) for name in ("eval.json", "own.json"))
+    assert ours["data"] == [[1.5, 0.1, 3, True, None, None, "ä"]]
+    assert ours == own
 
 
 EVERY_CALL = """
