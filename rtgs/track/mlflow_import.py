@@ -56,7 +56,7 @@ def _left_out(names: tuple[str, ...]) -> Iterator[None]:
     puts in the place meanwhile stays."""
     hidden = [name for name in names if name not in sys.modules]
     for name in hidden:
-        sys.modules[name] = None  # type: ignore[assignment]  # what Python's import takes for "there is none"
+        sys.modules.setdefault(name, None)  # type: ignore[arg-type]  # what Python's import takes for "there is none"
     try:
         yield
     finally:
