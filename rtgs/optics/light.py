@@ -53,12 +53,12 @@ def encoded_twin(light: Tensor) -> Tensor:
 def beyond_the_sensor(color: Tensor, light: float) -> Tensor:
     """Encoded colours of any shape, where a photo may have cut them off: 1 becomes ``light``, linear, at least 1.
 
-    Below :data:`CLIPPED_FROM` they stay, in between they rise evenly. Where they stand counts as given: there is no
-    gradient from it.
+    Up to :data:`CLIPPED_FROM` they stay, in between they rise evenly; what is brighter already stays as well. Where
+    they stand counts as given: there is no gradient from it.
     """
     share = ((color.detach() - CLIPPED_FROM) / (1 - CLIPPED_FROM)).clamp(0, 1)
     most = (1 + _OFFSET) * light ** (1 / _POWER) - _OFFSET
-    return color * (1 + (most - 1) * share)
+    return torch.maximum(color, (color * (1 + (most - 1) * share)).clamp_max(most))
 
 
 def _filled(kernel: str, *given: Tensor) -> Tensor:

@@ -15,6 +15,8 @@ from rtgs.mesh.inner_paths import InnerPaths, Leg
 from rtgs.methods import Mode, RenderOptions
 from rtgs.methods.model import Model
 from rtgs.methods.parts.glass import Glass
+from rtgs.methods.parts.wall_light import WallLight
+from rtgs.methods.settings import MethodSettings
 from rtgs.methods.shading.inner import TracedLeg, far_wall, inner_light
 from rtgs.optics.dielectric import wall_reflectance
 from rtgs.optics.light import decoded, encoded
@@ -97,8 +99,9 @@ def shown(method: Model, made: GlassScene):
         return method.render(view.camera, STEP, Mode.EVALUATE, RenderOptions(layers=True), view.mask)
 
 
-def test_the_layers_add_up_in_linear_light(made: GlassScene):
-    found = shown(begun(fresnel(bounces=2), made), made)
+@pytest.mark.parametrize("behind", [1.0, 2.0])
+def test_the_layers_add_up_in_linear_light(made: GlassScene, behind: float):
+    found = shown(begun(fresnel(bounces=2, clipped_light=behind), made), made)
     assert found.layers is not None
     light = {name: decoded(found.layers[name], "linear") for name in ("inner", "contents", "behind", "transmission")}
     total = light["inner"] + light["contents"] + light["behind"]
@@ -197,20 +200,25 @@ def test_settings_that_do_not_fit_are_refused(made: Callable[[], object], messag
         made()
 
 
+def white_behind(made: GlassScene, settings: MethodSettings, color: float = 1.0) -> Model:
+    """Nothing in the glass, and a base set of this encoded colour without gaps."""
+    method = begun(settings, made)
+    base, contents = method["base"].gaussians, method["transmittance"].gaussians
+    with torch.no_grad():
+        base["sh_dc"].fill_((color - 0.5) / 0.28209479)
+        base["sh_rest"].zero_()
+        base["opacity_logits"].fill_(9.0)
+        base["log_scales"].fill_(-0.5)
+        contents["opacity_logits"].fill_(-9.0)
+    return method
+
+
 @pytest.mark.parametrize(("color", "brighter"), [(1.0, 2.0), (0.8, 1.0)])
 def test_white_behind_the_glass_may_be_brighter_than_photos_show_it(made: GlassScene, color: float, brighter: float):
     """The walls take of it, and it stays white; what is darker is seen as before."""
     behind = []
     for light in (1.0, 2.0):
-        method = begun(fresnel(clipped_light=light), made)
-        base, contents = method["base"].gaussians, method["transmittance"].gaussians
-        with torch.no_grad():
-            base.sh_dc.fill_((color - 0.5) / 0.28209479)
-            base.sh_rest.zero_()
-            base.opacity_logits.fill_(9.0)
-            base.log_scales.fill_(-0.5)  # no gaps
-            contents.opacity_logits.fill_(-9.0)
-        found = shown(method, made)
+        found = shown(white_behind(made, fresnel(clipped_light=light), color), made)
         assert found.layers is not None
         behind.append(decoded(found.layers["transmitted_color"], "linear")[:, found.maps["transparent"]])
     plain = behind[0]
@@ -220,6 +228,20 @@ def test_white_behind_the_glass_may_be_brighter_than_photos_show_it(made: GlassS
     assert float(ratio.median()) == pytest.approx(brighter, rel=0.02)
     assert float(ratio.min()) > 0.999, "no light is lost"
     assert float(ratio.max()) < 1.02 * brighter
+
+
+@pytest.mark.parametrize("case", ["training", "openings are judged", "learned walls"])
+def test_it_is_no_brighter_where_photos_teach_or_judge(made: GlassScene, case: str, monkeypatch: pytest.MonkeyPatch):
+    if case == "openings are judged":
+        monkeypatch.setattr(WallLight, "judging", True)
+    mode = Mode.TRAIN if case == "training" else Mode.EVALUATE
+    view, images = made.scene.train[0], []
+    for light in (1.0, 2.0):
+        walls = WallSettings(clipped_light=light)
+        settings = glass_recipe(wall=walls) if case == "learned walls" else fresnel(clipped_light=light)
+        with torch.no_grad():
+            images.append(white_behind(made, settings).render(view.camera, STEP, mode, mask=view.mask).image)
+    assert torch.equal(*images)
 
 
 def test_a_sensor_stops_at_its_brightest_value_and_nowhere_else():

@@ -306,6 +306,7 @@ class Glass(Part):
             0 if own is None else self._own_degree(frame.step),
             frame.training and self._depth_loss_on(frame.step),
             frame.training and own is not None and own.density.needs_signal and self._densifying(frame.step),
+            not frame.training and self.wall is not None and not self.wall.judging,
         )
 
     def _own_degree(self, step: int) -> int:

@@ -60,6 +60,8 @@ class StraightRays:
         base_tree: of the base set as it is traced; the interface is not in it.
         measured: the loss on the first bounce's depth is on.
         watched: density control of the transmittance set learns from this view.
+        uncut: what lies behind a wall is shown with the light that photos of it cut off. Not where photos taken through
+            the glass teach what they need, nor where they judge.
     """
 
     settings: MethodSettings
@@ -70,6 +72,7 @@ class StraightRays:
     own_degree: int
     measured: bool
     watched: bool
+    uncut: bool
 
     def transmit(
         self,
@@ -90,7 +93,7 @@ class StraightRays:
         color, parts = first.colors, {}
         if self._goes_on:
             rows, behind = self._behind(rays if onward is None else onward, first, degree)
-            behind = behind if frame.training or wall is None else self._uncut(behind)
+            behind = self._uncut(behind) if self.uncut else behind
             over = self.settings.transmittance.compositing == "over"
             if wall is None:
                 color = color.index_add(0, rows, (1 - first.alpha)[rows, None] * behind if over else behind)
@@ -109,8 +112,7 @@ class StraightRays:
         return bounce == "first_bounce" or (bounce == "mesh" and not self.mesh.flat)
 
     def _uncut(self, behind: Tensor) -> Tensor:
-        """Colours (B, 3) behind a wall, with the light that photos of them cut off. Not in training, where photos taken
-        through the glass teach what they need."""
+        """Colours (B, 3) behind a wall, with the light that photos of them cut off."""
         light = self.settings.transmittance.wall.clipped_light
         return beyond_the_sensor(behind, light) if light > 1 else behind
 

@@ -143,6 +143,11 @@ class WallLight:
             return "none: no view tells whether what looks up is a wall"
         return str(self._openings or "")
 
+    @property
+    def judging(self) -> bool:
+        """Views are being rendered to find out where the object is open."""
+        return self._tried is not None
+
     def state(self) -> dict[str, Tensor]:
         """For a checkpoint: what was judged."""
         return {} if self._openings is None else self._openings.state()
