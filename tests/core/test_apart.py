@@ -15,11 +15,12 @@ from rtgs.core.errors import RtgsError
 
 HERE = Path(__file__)
 PARENT = """
-import sys
+import signal, sys
 from pathlib import Path
 from pipelines.cli.termination import Terminated, sigterm_raises
 from rtgs.core.apart import apart
 from test_apart import _waits
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job inherits that it is ignored
 folder = Path(sys.argv[1])
 if sys.argv[2] == "starts":
     sys.executable = str(folder / "slow_python")
