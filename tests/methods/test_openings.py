@@ -239,8 +239,23 @@ def test_a_run_judges_once_and_goes_on_bit_for_bit(standing: GlassScene):
     glass = method.parts["glass"]
     assert isinstance(glass, Glass)
     assert glass.plan.start < glass.plan.judged < 60
-    said = [event for step in range(glass.plan.start + 1, 60) for event in glass.judge(step, looked(method, step))]
+    wall, while_looking = glass.wall, []
+    assert wall is not None
+
+    def noted(step: int) -> Look:
+        look = looked(method, step)
+
+        def noting(view: View, options: RenderOptions) -> RenderedView:
+            while_looking.append(wall.judging)
+            return look(view, options)
+
+        return noting
+
+    said = [event for step in range(glass.plan.start + 1, 60) for event in glass.judge(step, noted(step))]
     assert len(said) == 1
+    assert while_looking
+    assert all(while_looking)
+    assert not wall.judging
     assert said[0].detail.startswith("openings of the object: ")
     state = {name: value.clone() for name, value in method.state().items()}
     assert "openings.part" in state
