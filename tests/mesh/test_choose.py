@@ -8,14 +8,14 @@ import pytest
 import torch
 
 from rtgs.core.errors import RtgsError
-from rtgs.mesh.choose import Choice, choose_object_mesh, read_given
+from rtgs.mesh.choose import Choice, _Candidates, choose_object_mesh, read_given
 from rtgs.mesh.outlines import plain_outlines
 from rtgs.mesh.pane import drawn_pane, fit_pane, is_flat
 from rtgs.mesh.settings import HullSettings, ObjectSettings, SurfaceSettings
 from rtgs.mesh.silhouettes import MaskSet, mask_set
 from rtgs.mesh.triangles import TriangleMesh, read_mesh_obj, write_mesh_obj, write_mesh_ply
 from tests.mesh.shapes import box, camera_at, pane, sphere
-from tests.mesh.test_hull import masks_of, ring
+from tests.mesh.test_hull import labelled_bottle, masks_of, ring
 
 SETTINGS = ObjectSettings(hull=HullSettings(voxels=40), surface=SurfaceSettings(fit="carved"))
 
@@ -65,6 +65,17 @@ def test_auto_compares_silhouettes_when_the_hull_is_poor() -> None:
     without = chosen("auto", masks, settings)
     assert without.mesh.source == "hull"
     assert any(each.what == "no TSDF mesh" for each in without.decisions)
+
+
+def test_a_mesh_is_scored_anew_once_the_hull_knows_what_is_hidden() -> None:
+    """Where a label hides a bottle, its masks have a bite; only from the carving on are such pixels left out."""
+    bottle, cameras, masks, base = labelled_bottle()
+    tried = _Candidates(mask_set(cameras, masks, base), SETTINGS, no_fusion)
+    before = tried.score(bottle).mean
+    assert tried.score(bottle).mean == before
+    tried.carve()
+    assert tried.score(bottle).mean > before + 0.01
+    assert tried.scores_of(bottle)[1].mean == before  # with all pixels
 
 
 def test_few_views_or_directions_make_no_hull() -> None:

@@ -148,8 +148,8 @@ def test_contents_do_not_hollow_the_container() -> None:
     assert volume(result.mesh) == pytest.approx(1.2**3, rel=0.15)
 
 
-def test_a_label_hides_but_does_not_carve() -> None:
-    """An opaque band round a third of a cylinder is a bite in a third of the masks; its depth tells it from the air."""
+def labelled_bottle() -> tuple[TriangleMesh, list, list, list]:
+    """A cylinder, cameras around it, its masks with a bite where a band hides it, and depths that show the band."""
     bottle = cylinder(0.5, 0.8)
     angle = np.degrees(np.arctan2(*cylinder(0.51, 0.25).vertices[:, 1::-1].T))
     whole = cylinder(0.51, 0.25)
@@ -158,7 +158,12 @@ def test_a_label_hides_but_does_not_carve() -> None:
     front, glass = depths(label, cameras), depths(bottle, cameras)
     masks = [(own > 0) & ~((near > 0) & (near < own)) for own, near in zip(glass, front)]
     background = depths(box((-4, -4, -1.5), (4, 4, -0.81)), cameras)
-    base = [torch.where(near > 0, near, far) for near, far in zip(front, background)]
+    return bottle, cameras, masks, [torch.where(near > 0, near, far) for near, far in zip(front, background)]
+
+
+def test_a_label_hides_but_does_not_carve() -> None:
+    """An opaque band round a third of a cylinder is a bite in a third of the masks; its depth tells it from the air."""
+    bottle, cameras, masks, base = labelled_bottle()
     without = carve_hull(mask_set(cameras, masks), COARSE)
     result = carve_hull(mask_set(cameras, masks, base), COARSE)
     found = [hit_score(ObjectMesh(item.mesh, "hull", item.voxel, False), bottle, ring(6)) for item in (without, result)]
