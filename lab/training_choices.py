@@ -45,6 +45,7 @@ class TrialScore:
     trial: Trial
     psnr: float
     ssim: float
+    cc_psnr: float  # after a colour fit to each view
     masked: float | None  # PSNR in the masks; None: the scene has none
     gaussians: int
     cpu_seconds: float
@@ -55,7 +56,7 @@ class TrialScore:
         trial = self.trial
         cells = (trial.scene, trial.method, trial.words or "as it is", str(trial.fold), str(trial.seed))
         masked = "-" if self.masked is None else f"{self.masked:.2f}"
-        cells += (f"{self.psnr:.2f}", f"{self.ssim:.3f}", masked, f"{self.gaussians:,}")
+        cells += (f"{self.psnr:.2f}", f"{self.ssim:.3f}", f"{self.cc_psnr:.2f}", masked, f"{self.gaussians:,}")
         return f"| {' | '.join(cells)} | {self.cpu_seconds:.0f} | {self.peak_mb:.0f} |"
 
 
@@ -67,7 +68,7 @@ def judged_in_training(scene: Scene, first: int = HELD_OUT // 2) -> Scene:
     return replace(kept, test=judged)
 
 
-HEADER = "| scene | method | choice | fold | seed | PSNR | SSIM | in masks | Gaussians | CPU s | peak MB |"
+HEADER = "| scene | method | choice | fold | seed | PSNR | SSIM | colours fitted | in masks | Gaussians | CPU s | peak MB |"
 
 
 def measure(trial: Trial) -> TrialScore:
@@ -82,8 +83,9 @@ def measure(trial: Trial) -> TrialScore:
     quality = run.quality()
     assert quality["psnr"] is not None
     assert quality["ssim"] is not None
+    assert quality["cc_psnr"] is not None
     count = sum(len(part) for part in run.method.sets)
-    means = (quality["psnr"], quality["ssim"], quality["psnr_masked"])
+    means = (quality["psnr"], quality["ssim"], quality["cc_psnr"], quality["psnr_masked"])
     return TrialScore(trial, *means, count, run.cpu_seconds, run.peak_memory_mb)
 
 

@@ -28,8 +28,8 @@ class TrainedRun:
     peak_memory_mb: float
 
     def quality(self) -> dict[str, float | None]:
-        """Means over the held-out views: psnr, ssim, psnr_masked where there are masks, and psnr_specular and
-        psnr_diffuse_part where truth is known."""
+        """Means over the held-out views: psnr, ssim, cc_psnr (after a colour fit to each view), psnr_masked where
+        there are masks, and psnr_specular and psnr_diffuse_part where truth is known."""
         from rtgs.evaluate.evaluate import TimedRender, evaluate_views
         from rtgs.evaluate.records import RunFacts
         from rtgs.evaluate.settings import EvaluationSettings
@@ -43,9 +43,8 @@ class TrainedRun:
         settings = EvaluationSettings(lpips=False, eight_bit=False)
         facts = RunFacts(self.scene.name, "")
         table = evaluate_views([TimedRender(image) for image in images], self.scene.test, facts, settings)
-        return {
-            name: table.mean(name) for name in ("psnr", "ssim", "psnr_masked", "psnr_specular", "psnr_diffuse_part")
-        }
+        names = ("psnr", "ssim", "cc_psnr", "psnr_masked", "psnr_specular", "psnr_diffuse_part")
+        return {name: table.mean(name) for name in names}
 
 
 def schedule_overrides(steps: int, preset: str) -> list[str]:
