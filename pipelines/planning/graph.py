@@ -10,10 +10,12 @@ from dataclasses import asdict, dataclass, replace
 from pipelines.planning.inspection import Inspections
 from pipelines.planning.judge import (
     Opponent,
+    exposures_as_judged,
     hold_out_views,
     judging_of,
     rest_of,
     until_judged,
+    why_exposures_unseen,
     why_judged_late,
     why_unjudged,
 )
@@ -125,7 +127,8 @@ def build_graph(config: RunConfig, choices: Choices, inspections: Inspections | 
         mesh = extract_mesh.STEP.step(_mesh_params(config), scene, *training)
     made = (rendered, measured) if mesh is None else (mesh, rendered, measured)
     unread = find_method(config.method.name).unread_losses(config.method)
-    moved = (*_moved_starts(config, transparency.present), *why_judged_late(config, opponent))
+    late = (*why_judged_late(config, opponent), *why_exposures_unseen(config))
+    moved = (*_moved_starts(config, transparency.present), *late)
     params = _report_params(config, choices, skipped, (*unread, *moved))
     page = report.STEP.step(params, *prepared.steps, scene, *training, *judge_steps, *made)
     return RunGraph(scene, training, rendered, measured, page, mesh, judge_steps, skipped, unread, moved)
@@ -180,7 +183,7 @@ def _training(
     steps: list[Step] = []
     object_mesh = None
     spec = find_method(method.name)
-    method = method.in_scene(glass=_through_glass(config, transparent))
+    method = exposures_as_judged(config, method.in_scene(glass=_through_glass(config, transparent)))
     if spec.elsewhere:
         return (), None
     for stage in until_judged(config, opponent, spec.timeline(method, config.schedule, transparent=transparent)):

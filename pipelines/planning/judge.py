@@ -47,7 +47,10 @@ class Opponent:
         Raises:
             hydra.errors.HydraException: judge.plain is no file of conf/method.
         """
-        return Opponent(*compose_plain(config.judge.plain, choices)) if judged(config) else None
+        if not judged(config):
+            return None
+        method, schedule = compose_plain(config.judge.plain, choices)
+        return Opponent(exposures_as_judged(config, method), schedule)
 
 
 @dataclass(frozen=True)
@@ -86,6 +89,27 @@ def _learned_of_photos(config: RunConfig, opponent: Opponent) -> tuple[str, ...]
     names = {"method": config.method, f"method={config.judge.plain}: method": opponent.method}
     keys = ("poses", "appearance")
     return tuple(f"{of}.{key}.enabled" for of, own in names.items() for key in keys if getattr(own, key).enabled)
+
+
+def exposures_as_judged(config: RunConfig, method: MethodSettings) -> MethodSettings:
+    """Settings of a training whose photos join in two parts: it does not look whether their exposures differ, for those
+    that join late would come too late to learn theirs."""
+    if not _looks_too_early(config):
+        return method
+    return replace(method, appearance=replace(method.appearance, learn_above=None))
+
+
+def why_exposures_unseen(config: RunConfig) -> tuple[Decision, ...]:
+    """Why a judged run does not look at its photos' exposures; empty: it does, or was not asked to."""
+    appearance = config.method.appearance
+    if not _looks_too_early(config) or appearance.enabled or appearance.learn_above is None:
+        return ()
+    why = f"some photos join at {config.judge.at:g} of the last stage (judge.at), too late to learn theirs"
+    return (Decision("exposures of photos not compared", why),)
+
+
+def _looks_too_early(config: RunConfig) -> bool:
+    return judged(config) and config.judge.at < 1
 
 
 def judging_of(

@@ -67,6 +67,7 @@ def create_method(
     """
     from rtgs.methods.model import Model
     from rtgs.methods.parts.count_bounds import SceneCounts, bound_counts
+    from rtgs.methods.parts.exposure import as_photographed
 
     spec = find_method(settings.name)
     if object_mesh is not None and spec.object_stage(settings) is None:
@@ -75,7 +76,8 @@ def create_method(
     drawn = scene.random_points or settings.init.random_points > 0
     counts = SceneCounts(pixels, None if drawn else len(scene.points))
     settings, lowered = bound_counts(settings.in_scene(glass=object_mesh is not None), counts)
-    decisions = (*lowered, *spec.unread_losses(settings))
+    settings, exposures = as_photographed(settings, scene)
+    decisions = (*lowered, *exposures, *spec.unread_losses(settings))
     stages = spec.timeline(settings, schedule, transparent=object_mesh is not None)
     made = spec.build(
         Setup(spec, settings, scene, schedule, generator, object_mesh, stages, decisions, spec.own_settings(settings))

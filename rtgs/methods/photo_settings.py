@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
-from rtgs.core.refuse import refuse_bad_counts, refuse_bad_numbers, refuse_unless
+from rtgs.core.recipe import UNLESS_DEFAULT
+from rtgs.core.refuse import refuse_bad_counts, refuse_bad_numbers, refuse_below, refuse_unless
 
 
 @dataclass(frozen=True)
 class AppearanceSettings:
-    """Exposure and tint of each training photo; test views take none (decision 65).
+    """Exposure and tint of each training photo; a test view takes those of the nearest (decision 65).
 
     Numbers of PPISP's exposure and colour (nv-tlabs/ppisp), its vignetting and response curve left out.
     """
 
     enabled: bool = False
+    # Learned as well where half of the photos differ from the median one by more stops; None: not looked at. Short
+    # presets: photos of six captures by .06 to .11, path-traced ones by at most .03 (docs/photos.md).
+    learn_above: float | None = field(default=None, metadata=UNLESS_DEFAULT)
     rate: float = 2e-3  # of Adam, in stops and in shares of a channel
     rate_end: float = 2e-5  # at the end of the run
     warm_up: int = 500  # steps over which the rate rises, at most a quarter of the run
@@ -27,6 +31,7 @@ class AppearanceSettings:
             value = getattr(self, name)
             refuse_unless(value > 0, f"method.appearance.{name}", value, "above 0 (enabled=false learns nothing)")
         refuse_bad_counts(self, "method.appearance", warm_up=0)
+        refuse_below("method.appearance.learn_above", self.learn_above, 0)
 
 
 @dataclass(frozen=True)

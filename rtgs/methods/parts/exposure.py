@@ -1,7 +1,9 @@
 """Exposure and tint of each training photo (docs/photos.md; PPISP's exposure and colour).
 
 The photo is taken to be 2^t M times what the Gaussians show, both as sRGB encodes them. M is the identity and a small
-matrix that keeps the mean of a grey's channels: brightness is t's alone.
+matrix that keeps the mean of a grey's channels: brightness is t's alone. A view of the scene that is not trained on
+takes what the two training photos nearest to it have, where training photos are so told by those nearest to them:
+nothing of its own photo is known. Other cameras take none.
 """
 
 from __future__ import annotations
@@ -18,20 +20,25 @@ from rtgs.core.decisions import Decision
 from rtgs.core.errors import RtgsError
 from rtgs.methods.parts.feature_mirror import SH_IMAGE
 from rtgs.methods.parts.part import Frame, Part
+from rtgs.scenes.exposures import exposure_spread
 from rtgs.train.method import RenderedView
 from rtgs.train.parameters import ParameterGroup, Rate
 from rtgs.train.terms import LossTerm
 
 if TYPE_CHECKING:
+    from rtgs.core.cameras import Camera
+    from rtgs.methods.settings import MethodSettings
     from rtgs.methods.spec import Setup
     from rtgs.scenes.scene import Scene, View
 
+NEAREST = 2  # photos that a test view takes its exposure from
+SAME = 1e-4  # added to squared distances: nearer than a hundredth is the same place
 LIMITS = (-4.0, 4.0)  # of all numbers: far beyond what photos of one scene differ by
 BETA = 0.1  # where the smooth L1 loss of a mean turns from square to straight
 
 
 class Exposure(Part):
-    """A gain 2^t and a colour matrix for each training view; other views are shown without."""
+    """A gain 2^t and a colour matrix for each training view; test views take those of the nearest."""
 
     name = "exposure"
 
@@ -39,6 +46,8 @@ class Exposure(Part):
         """Raises RtgsError where views cannot be told apart by their names."""
         settings, total = setup.settings.appearance, setup.schedule.total
         self.rows = rows_by_name(setup.scene, "method.appearance.enabled")
+        seen, unseen = setup.scene.train, (*setup.scene.test, *setup.scene.held)
+        self.nearest = {view.camera.name: nearest_photos(view.camera, setup.scene) for view in (*seen, *unseen)}
         count = len(self.rows)
         warm_up = min(settings.warm_up, total // 4)
         self.group = ParameterGroup(
@@ -57,19 +66,37 @@ class Exposure(Part):
     def decisions(self) -> tuple[Decision, ...]:
         stops = self.group["stops"].detach()
         found = f", {float(stops.min()):+.3f} to {float(stops.max()):+.3f} stops" if bool(stops.any()) else ""
-        why = f"method.appearance.enabled, {len(self.rows)} photos{found}; test views take none"
+        why = f"method.appearance.enabled, {len(self.rows)} photos{found}; a test view takes those of the nearest two"
         return (Decision("exposure of each photo learned", why),)
 
     def finish(self, frame: Frame, shaded: RenderedView) -> RenderedView:
-        """As the photo of this name was exposed."""
-        row = self.rows.get(frame.camera.name)
-        if row is None:
+        """As the photo of this name was exposed, or those nearest to it."""
+        found = self._of(frame.camera.name)
+        if found is None:
             return shaded
-        stops, colors = self.group["stops"][row], self.group["colors"][row]
+        stops, colors = found
         maps = dict(shaded.maps)
         if SH_IMAGE in maps:  # a loss of its own compares it with the photo
             maps[SH_IMAGE] = exposed(maps[SH_IMAGE], stops, colors)
         return replace(shaded, image=exposed(shaded.image, stops, colors), maps=maps)
+
+    def _of(self, name: str) -> tuple[Tensor, Tensor] | None:
+        """Stops () and colours (3, 3) of the view of this name; None: it has none, and nothing tells it."""
+        if (row := self.rows.get(name)) is not None:
+            return self.group["stops"][row], self.group["colors"][row]
+        if name not in self.nearest or not self.neighbours_tell():
+            return None
+        rows, weights = self.nearest[name]
+        return weights @ self.group["stops"][rows], torch.tensordot(weights, self.group["colors"][rows], dims=1)
+
+    @torch.no_grad()
+    def neighbours_tell(self) -> bool:
+        """The training photos nearest to each tell its brightness better than the mean of all does.
+
+        They do where a camera sets its exposure by what it sees. Where photos were exposed at random they do not."""
+        stops = self.group["stops"]
+        told = torch.stack([weights @ stops[rows] for rows, weights in (self.nearest[name] for name in self.rows)])
+        return bool((told - stops).square().sum() < (stops - stops.mean()).square().sum())
 
     def terms(self) -> Iterator[LossTerm]:
         """What holds the means over all photos, which the set's own colours could take up."""
@@ -92,6 +119,47 @@ def exposed(image: Tensor, stops: Tensor, colors: Tensor) -> Tensor:
     return (matrix @ image.flatten(1)).reshape(image.shape)
 
 
+def nearest_photos(camera: Camera, scene: Scene) -> tuple[Tensor, Tensor]:
+    """Rows (K,) of the two training views, other than its own, whose cameras are nearest to ``camera``, and their
+    weights (K,), which add up to 1: one over the squared distance, of the centre in scene extents and of the axis in
+    radians."""
+    cameras = [view.camera for view in scene.train]
+    centers, axes = (torch.stack(each) for each in ([c.center for c in cameras], [c.rotation[2] for c in cameras]))
+    angles = torch.arccos((axes @ camera.rotation[2]).clamp(-1, 1))
+    squares = ((centers - camera.center) / scene.extent).square().sum(1) + angles.square()
+    squares[[other is camera for other in cameras]] = torch.inf
+    found, rows = squares.topk(min(NEAREST, len(squares)), largest=False)
+    weights = 1 / (found + SAME)
+    return rows, (weights / weights.sum().clamp_min(1e-30)).float()  # 0: there is no other view
+
+
+def as_photographed(settings: MethodSettings, scene: Scene) -> tuple[MethodSettings, tuple[Decision, ...]]:
+    """The settings with exposures learned where the scene's photos ask for it, and what decided it."""
+    appearance = settings.appearance
+    if appearance.enabled or appearance.learn_above is None:
+        return settings, ()
+    key = f"method.appearance.learn_above is {appearance.learn_above:g}"
+    spread = exposure_spread(scene)
+    if spread is None:
+        why = f"too few points are seen in several photos to compare their exposures ({key})"
+    elif spread <= appearance.learn_above:
+        why = f"half of the photos are within {spread:.3f} stops of the median one, and {key}"
+    elif not told_apart(scene):
+        why = f"half of the photos are {spread:.3f} stops off the median one, but names do not tell the cameras apart"
+    else:
+        why = f"half of the photos are {spread:.3f} stops or more off the median one, and {key}"
+        asked = replace(settings, appearance=replace(appearance, enabled=True))
+        return asked, (Decision("exposures of photos differ", why),)
+    return settings, (Decision("no exposures learned", why),)
+
+
+def told_apart(scene: Scene) -> bool:
+    """Each training view has a name that no other view has."""
+    names = [view.camera.name for view in scene.train]
+    others = {view.camera.name for view in (*scene.test, *scene.held)}
+    return "" not in names and len(set(names)) == len(names) and others.isdisjoint(names)
+
+
 def rows_by_name(scene: Scene, key: str) -> dict[str, int]:
     """Rows of the training views by the name of their cameras.
 
@@ -99,8 +167,7 @@ def rows_by_name(scene: Scene, key: str) -> dict[str, int]:
         RtgsError: two have one name, or none; ``key`` is what asks for it.
     """
     names = [view.camera.name for view in scene.train]
-    others = {view.camera.name for view in (*scene.test, *scene.held)}
-    if "" in names or len(set(names)) < len(names) or not others.isdisjoint(names):
+    if not told_apart(scene):
         raise RtgsError(
             f"{key} learns something of each photo and knows it by its camera's name, but in scene {scene.name} the "
             f"names of {len(names)} training views are {_some(names)} and not all their own: name the cameras as views "
