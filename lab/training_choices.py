@@ -68,9 +68,7 @@ def judged_in_training(scene: Scene, first: int = HELD_OUT // 2) -> Scene:
     return replace(kept, test=judged)
 
 
-HEADER = (
-    "| scene | method | choice | fold | seed | PSNR | SSIM | fitted | in masks | Gaussians | CPU s | peak MB |"
-)
+HEADER = "| scene | method | choice | fold | seed | PSNR | SSIM | fitted | in masks | Gaussians | CPU s | peak MB |"
 
 
 def measure(trial: Trial) -> TrialScore:

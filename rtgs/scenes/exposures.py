@@ -26,7 +26,7 @@ def photo_stops(scene: Scene) -> Tensor | None:
     A point's brightness in a photo is taken to be its own times the photo's, and both are fitted by medians in turns,
     which points hidden in a photo, glossy or in masks of glass do not move.
     """
-    if scene.random_points or not len(scene.points):
+    if scene.random_points or not len(scene.points) or len(scene.train) < 2:
         return None
     points = scene.points[:: -(-len(scene.points) // MOST_POINTS)]
     seen = torch.stack([_brightness(view, points) for view in scene.train])

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from training_cases import named, small_method, small_scene, small_schedule, small_trainer
+from training_cases import HEIGHT, WIDTH, named, small_method, small_scene, small_schedule, small_trainer
 
 from rtgs.gaussians.settings import InitSettings
 from rtgs.methods import MethodSettings, Mode, create_method
@@ -44,6 +45,16 @@ def photographed(kind: str, views: int = 13) -> Scene:
     off = points + 0.03 * torch.randn(COUNT, 3, generator=generator)
     train, test = (tuple(map(photo, each)) for each in (scene.train, scene.test))
     return replace(scene, train=train, test=test, points=off, point_colors=0.5 * colors + 0.25)
+
+
+def grey_photos(stops: Sequence[float], **changes: object) -> Scene:
+    """A sphere of one grey, each of whose training photos is brighter by its stops; one more photo is for test."""
+    scene = named(small_scene(len(stops) + 1))
+    train = (
+        replace(view, image=torch.full((3, HEIGHT, WIDTH), 0.4) * 2**each)
+        for view, each in zip(scene.train, stops, strict=True)
+    )
+    return replace(scene, train=tuple(train), **changes)  # type: ignore[arg-type]
 
 
 def misplaced(scene: Scene, size: float) -> Scene:

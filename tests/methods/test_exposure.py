@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from photo_cases import photographed, plain, steady, trained
+from photo_cases import grey_photos, photographed, plain, steady, trained
 from safetensors.torch import load_file
 from training_cases import small_scene, small_trainer
 
@@ -15,9 +16,10 @@ from rtgs.core.errors import RtgsError
 from rtgs.evaluate.metrics import cc_psnr
 from rtgs.gaussians.ply import write_ply
 from rtgs.methods import Mode, create_method
-from rtgs.methods.parts.exposure import exposed, rows_by_name
+from rtgs.methods.parts.exposure import Exposure, as_photographed, exposed, nearest_photos, rows_by_name
 from rtgs.methods.photo_settings import AppearanceSettings
-from rtgs.scenes.scene import Scene
+from rtgs.render.pose import moved
+from rtgs.scenes.scene import Scene, View
 from rtgs.train.checkpoint import checkpoint_path
 from rtgs.train.guard import TrainingDiverged
 from rtgs.train.seeds import generator_for
@@ -55,7 +57,7 @@ def test_brightness_is_that_of_the_stops_alone():
     assert float(brighter.std(0).mean()) > 0.01
 
 
-def test_views_that_it_was_not_trained_on_are_shown_without():
+def test_cameras_that_are_no_view_of_the_scene_are_shown_without():
     scene, _ = exposed_scene(photographed("2dgs", views=5))
     trainer, _ = trained(scene, replace(plain("2dgs"), appearance=FAST), 60)
     first = scene.train[0].camera
@@ -64,6 +66,102 @@ def test_views_that_it_was_not_trained_on_are_shown_without():
     group = trainer.method.groups[0]
     torch.testing.assert_close(shown, exposed(bare, group["stops"][0], group["colors"][0]))  # type: ignore[index]
     assert not torch.allclose(shown, bare, atol=1e-3)
+
+
+def smooth(scene: Scene) -> Scene:
+    """All photos, the test view's too, exposed by where they were taken from: up to half a stop apart."""
+
+    def at(view: View) -> View:
+        angle = math.atan2(float(view.camera.center[0]), float(view.camera.center[2]))
+        return replace(view, image=view.image * 2 ** (0.25 * math.sin(angle)))
+
+    train, test = (tuple(map(at, each)) for each in (scene.train, scene.test))
+    return replace(scene, train=train, test=test)
+
+
+def test_a_test_view_takes_the_exposure_of_the_photos_nearest_to_it():
+    scene = smooth(photographed("2dgs"))
+    trainer, summary = trained(scene, replace(plain("2dgs"), appearance=FAST), TOTAL)
+    (test,) = scene.test
+    part = trainer.method.parts["exposure"]
+    assert isinstance(part, Exposure)
+    assert part.neighbours_tell()
+    rows, weights = nearest_photos(test.camera, scene)
+    assert sorted(rows.tolist()) == [0, len(scene.train) - 1]  # on the ring, before and after it
+    with torch.no_grad():
+        shown = trainer.method.render(test.camera, TOTAL, Mode.EVALUATE).image
+        bare = trainer.method.render(replace(test.camera, name="nobody"), TOTAL, Mode.EVALUATE).image
+        stops, colors = part.group["stops"][rows], part.group["colors"][rows]
+        mean = exposed(bare, (weights * stops).sum(), (weights[:, None, None] * colors).sum(0))
+    torch.testing.assert_close(shown, mean)
+    error, without = (float((image.clamp(0, 1) - test.image).square().mean()) for image in (shown, bare))
+    assert error < without
+    assert summary.psnr_test == pytest.approx(-10 * math.log10(error), abs=0.01)
+
+
+def test_photos_exposed_at_random_tell_nothing_of_a_test_view():
+    scene, stops = exposed_scene(photographed("2dgs", views=9))
+    trainer, _ = trained(scene, replace(plain("2dgs"), appearance=FAST), 60)
+    part = trainer.method.parts["exposure"]
+    assert isinstance(part, Exposure)
+    with torch.no_grad():
+        part.group["stops"].copy_(stops)
+    assert not part.neighbours_tell()
+    camera = scene.test[0].camera
+    shown, bare = (
+        trainer.method.render(each, 60, Mode.EVALUATE).image for each in (camera, replace(camera, name="nobody"))
+    )
+    assert torch.equal(shown, bare)
+    with torch.no_grad():
+        part.group["stops"].copy_(torch.linspace(-0.4, 0.4, len(stops)))  # one after the other on the ring
+    assert part.neighbours_tell()
+    assert not torch.equal(trainer.method.render(camera, 60, Mode.EVALUATE).image, bare)
+
+
+def test_nearest_photos_are_weighted_by_distance_and_turn():
+    scene = photographed("2dgs", views=5)
+    first = scene.train[0].camera
+    near = moved(first, torch.tensor([0.0, 0.0, 0.0, *[0.0] * 6]), scene.extent).of(first)
+    rows, weights = nearest_photos(near, scene)
+    assert int(rows[0]) == 0
+    assert float(weights[0]) > 0.999
+    rows, weights = nearest_photos(first, scene)  # of a training view: others
+    assert 0 not in rows.tolist()
+    assert float(weights.sum()) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.3])
+def test_exposures_are_learned_where_photos_differ(spread: float):
+    scene = grey_photos([0.0, spread, -spread, spread, 0.0, -spread])
+    asked = replace(plain("3dgs"), appearance=AppearanceSettings(learn_above=0.15))
+    method = create_method(asked, scene, steady(20), generator_for(0, "initialise"))
+    assert ("exposure" in method.parts) == (spread > 0)
+    what = "exposures of photos differ" if spread > 0 else "no exposures learned"
+    (told,) = (each for each in method.decisions if each.what == what)
+    assert "method.appearance.learn_above is 0.15" in told.why
+
+
+def test_nothing_is_compared_where_it_is_not_asked_for():
+    scene, _ = exposed_scene(photographed("3dgs", views=7))
+    assert as_photographed(plain("3dgs"), scene) == (plain("3dgs"), ())
+    asked = replace(plain("3dgs"), appearance=replace(FAST, learn_above=0.01))
+    assert as_photographed(asked, scene) == (asked, ())  # learned anyway
+
+
+@pytest.mark.parametrize("why", ["names do not tell", "too few points"])
+def test_why_exposures_that_differ_are_not_learned(why: str):
+    scene = grey_photos([-0.3, 0.0, 0.3, 0.3, -0.3, 0.0])
+    if why == "too few points":
+        scene = replace(scene, random_points=True)
+    else:
+        first, second, *others = scene.train
+        twin = replace(second, camera=replace(second.camera, name=first.camera.name))
+        scene = replace(scene, train=(first, twin, *others))
+    asked = replace(plain("3dgs"), appearance=AppearanceSettings(learn_above=0.01))
+    settings, (told,) = as_photographed(asked, scene)
+    assert settings == asked
+    assert told.what == "no exposures learned"
+    assert why in told.why
 
 
 def test_the_means_over_the_photos_are_held():

@@ -94,6 +94,17 @@ def test_what_the_plain_method_learns_of_each_photo_needs_all_of_it_too():
     assert told.why.startswith("method=3dgs: method.appearance.enabled learns")
 
 
+@pytest.mark.parametrize(("words", "looks"), [((), False), (("judge.at=1",), True), (("judge=none",), True)])
+def test_photos_that_join_late_are_not_compared_by_their_exposures(words: tuple[str, ...], looks: bool):
+    found = graph(*GLASS, "judge=photos", *words)
+    trainings = (*found.training, *(step for step in found.judge if step.name.startswith("plain")))
+    assert all((step.params.method.appearance.learn_above is not None) is looks for step in trainings)
+    told = [each for each in found.moved if each.what == "exposures of photos not compared"]
+    assert len(told) == (not looks)
+    asked = graph(*GLASS, "judge=photos", "method.appearance.enabled=true", *words)
+    assert not [each for each in asked.moved if each.what == "exposures of photos not compared"]
+
+
 def test_a_rest_that_a_judge_drops_says_nothing_of_the_pace(tmp_path: Path):
     *_, last, rest = graph(*GLASS, "judge=photos").training
     plan = Plan((PlannedStep(last, False, ""), PlannedStep(rest, False, "")))
