@@ -10,7 +10,7 @@ from rtgs.core.refuse import refuse_bad_counts, refuse_bad_numbers, refuse_below
 
 @dataclass(frozen=True)
 class AppearanceSettings:
-    """Exposure and tint of each training photo; a test view takes those of the nearest (decision 65).
+    """Exposure and tint of each training photo; a test view is told by the nearest (decision 65).
 
     Numbers of PPISP's exposure and colour (nv-tlabs/ppisp), its vignetting and response curve left out.
     """

@@ -12,6 +12,7 @@ from photo_cases import grey_photos, photographed, plain, steady, trained
 from safetensors.torch import load_file
 from training_cases import small_scene, small_trainer
 
+from rtgs.core.cameras import Camera
 from rtgs.core.errors import RtgsError
 from rtgs.evaluate.metrics import cc_psnr
 from rtgs.gaussians.ply import write_ply
@@ -23,6 +24,7 @@ from rtgs.scenes.scene import Scene, View
 from rtgs.train.checkpoint import checkpoint_path
 from rtgs.train.guard import TrainingDiverged
 from rtgs.train.seeds import generator_for
+from rtgs.train.trainer import Trainer
 
 FAST = AppearanceSettings(enabled=True, rate=0.05, rate_end=5e-4)
 TOTAL = 300
@@ -79,43 +81,53 @@ def smooth(scene: Scene) -> Scene:
     return replace(scene, train=train, test=test)
 
 
+def exposure_of(trainer: Trainer) -> Exposure:
+    part = trainer.method.parts["exposure"]  # type: ignore[attr-defined]
+    assert isinstance(part, Exposure)
+    return part
+
+
 def test_a_test_view_takes_the_exposure_of_the_photos_nearest_to_it():
     scene = smooth(photographed("2dgs"))
     trainer, summary = trained(scene, replace(plain("2dgs"), appearance=FAST), TOTAL)
     (test,) = scene.test
-    part = trainer.method.parts["exposure"]
-    assert isinstance(part, Exposure)
-    assert part.neighbours_tell()
+    part = exposure_of(trainer)
     rows, weights = nearest_photos(test.camera, scene)
     assert sorted(rows.tolist()) == [0, len(scene.train) - 1]  # on the ring, before and after it
+    trust = part.trust()
+    assert trust["stops"] > 0.8
     with torch.no_grad():
         shown = trainer.method.render(test.camera, TOTAL, Mode.EVALUATE).image
         bare = trainer.method.render(replace(test.camera, name="nobody"), TOTAL, Mode.EVALUATE).image
         stops, colors = part.group["stops"][rows], part.group["colors"][rows]
-        mean = exposed(bare, (weights * stops).sum(), (weights[:, None, None] * colors).sum(0))
-    torch.testing.assert_close(shown, mean)
+        mean = (weights * stops).sum(), (weights[:, None, None] * colors).sum(0)
+        expected = exposed(bare, trust["stops"] * mean[0], trust["colors"] * mean[1])
+    torch.testing.assert_close(shown, expected)
     error, without = (float((image.clamp(0, 1) - test.image).square().mean()) for image in (shown, bare))
     assert error < without
     assert summary.psnr_test == pytest.approx(-10 * math.log10(error), abs=0.01)
 
 
-def test_photos_exposed_at_random_tell_nothing_of_a_test_view():
-    scene, stops = exposed_scene(photographed("2dgs", views=9))
-    trainer, _ = trained(scene, replace(plain("2dgs"), appearance=FAST), 60)
-    part = trainer.method.parts["exposure"]
-    assert isinstance(part, Exposure)
-    with torch.no_grad():
-        part.group["stops"].copy_(stops)
-    assert not part.neighbours_tell()
-    camera = scene.test[0].camera
-    shown, bare = (
-        trainer.method.render(each, 60, Mode.EVALUATE).image for each in (camera, replace(camera, name="nobody"))
-    )
-    assert torch.equal(shown, bare)
-    with torch.no_grad():
-        part.group["stops"].copy_(torch.linspace(-0.4, 0.4, len(stops)))  # one after the other on the ring
-    assert part.neighbours_tell()
-    assert not torch.equal(trainer.method.render(camera, 60, Mode.EVALUATE).image, bare)
+def test_neighbours_are_believed_as_far_as_training_photos_agree_with_theirs():
+    scene = photographed("2dgs", views=17)
+    trainer = small_trainer(scene, replace(plain("2dgs"), appearance=FAST), steady(20))
+    part, camera = exposure_of(trainer), scene.test[0].camera
+    count = len(scene.train)
+
+    def shown(of: Camera, stops: torch.Tensor) -> torch.Tensor:
+        with torch.no_grad():
+            part.group["stops"].copy_(stops)
+            return trainer.method.render(of, 20, Mode.EVALUATE).image
+
+    ring = torch.sin(torch.arange(count) * 2 * math.pi / (count + 1) + 0.5)
+    in_turns = 0.3 * (-1.0) ** torch.arange(count)
+    bare = shown(replace(camera, name="nobody"), ring)
+    assert not torch.equal(shown(camera, ring), bare)
+    assert part.trust()["stops"] > 0.9
+    assert torch.equal(shown(camera, in_turns), bare)  # each is as far off as can be from those beside it
+    assert part.trust() == {"stops": 0.0, "colors": 0.0}
+    shown(camera, 0.5 * ring + 0.5 * in_turns)
+    assert 0.1 < part.trust()["stops"] < 0.9
 
 
 def test_nearest_photos_are_weighted_by_distance_and_turn():

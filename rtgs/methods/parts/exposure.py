@@ -2,7 +2,7 @@
 
 The photo is taken to be 2^t M times what the Gaussians show, both as sRGB encodes them. M is the identity and a small
 matrix that keeps the mean of a grey's channels: brightness is t's alone. A view of the scene that is not trained on
-takes what the two training photos nearest to it have, where training photos are so told by those nearest to them:
+takes what the two training photos nearest to it have, as far as training photos are told so by those nearest to them:
 nothing of its own photo is known. Other cameras take none.
 """
 
@@ -84,19 +84,23 @@ class Exposure(Part):
         """Stops () and colours (3, 3) of the view of this name; None: it has none, and nothing tells it."""
         if (row := self.rows.get(name)) is not None:
             return self.group["stops"][row], self.group["colors"][row]
-        if name not in self.nearest or not self.neighbours_tell():
+        if (near := self.nearest.get(name)) is None:
             return None
-        rows, weights = self.nearest[name]
-        return weights @ self.group["stops"][rows], torch.tensordot(weights, self.group["colors"][rows], dims=1)
+        stops, colors = (share * told(self.group[key], near) for key, share in self.trust().items())
+        return stops, colors
 
     @torch.no_grad()
-    def neighbours_tell(self) -> bool:
-        """The training photos nearest to each tell its brightness better than the mean of all does.
-
-        They do where a camera sets its exposure by what it sees. Where photos were exposed at random they do not."""
-        stops = self.group["stops"]
-        told = torch.stack([weights @ stops[rows] for rows, weights in (self.nearest[name] for name in self.rows)])
-        return bool((told - stops).square().sum() < (stops - stops.mean()).square().sum())
+    def trust(self) -> dict[str, float]:
+        """How much of what the nearest photos say is believed of a view, from 0 to 1: least squares over the training
+        photos, each told by those nearest to it. Near 1 where a camera sets its exposure by what it sees, 0 where
+        photos were exposed at random."""
+        shares = {}
+        for key in ("stops", "colors"):
+            values = self.group[key]
+            guesses = torch.stack([told(values, self.nearest[name]) for name in self.rows])
+            fit = (guesses * values).sum() / guesses.square().sum().clamp_min(1e-12)
+            shares[key] = float(fit.clamp(0, 1))
+        return shares
 
     def terms(self) -> Iterator[LossTerm]:
         """What holds the means over all photos, which the set's own colours could take up."""
@@ -110,6 +114,12 @@ class Exposure(Part):
 
         weights = (("exposure", "stops", self.settings.mean_exposure), ("tint", "colors", self.settings.mean_color))
         yield from (LossTerm(name, weight, held(key)) for name, key, weight in weights if weight > 0)
+
+
+def told(values: Tensor, near: tuple[Tensor, Tensor]) -> Tensor:
+    """The mean of some rows of ``values`` (V, ...) by rows (K,) and weights (K,)."""
+    rows, weights = near
+    return torch.tensordot(weights, values[rows], dims=1)
 
 
 def exposed(image: Tensor, stops: Tensor, colors: Tensor) -> Tensor:
@@ -144,7 +154,7 @@ def as_photographed(settings: MethodSettings, scene: Scene) -> tuple[MethodSetti
         why = f"too few points are seen in several photos to compare their exposures ({key})"
     elif spread <= appearance.learn_above:
         why = f"half of the photos are within {spread:.3f} stops of the median one, and {key}"
-    elif not told_apart(scene):
+    elif not have_own_names(scene):
         why = f"half of the photos are {spread:.3f} stops off the median one, but names do not tell the cameras apart"
     else:
         why = f"half of the photos are {spread:.3f} stops or more off the median one, and {key}"
@@ -153,7 +163,7 @@ def as_photographed(settings: MethodSettings, scene: Scene) -> tuple[MethodSetti
     return settings, (Decision("no exposures learned", why),)
 
 
-def told_apart(scene: Scene) -> bool:
+def have_own_names(scene: Scene) -> bool:
     """Each training view has a name that no other view has."""
     names = [view.camera.name for view in scene.train]
     others = {view.camera.name for view in (*scene.test, *scene.held)}
@@ -167,7 +177,7 @@ def rows_by_name(scene: Scene, key: str) -> dict[str, int]:
         RtgsError: two have one name, or none; ``key`` is what asks for it.
     """
     names = [view.camera.name for view in scene.train]
-    if not told_apart(scene):
+    if not have_own_names(scene):
         raise RtgsError(
             f"{key} learns something of each photo and knows it by its camera's name, but in scene {scene.name} the "
             f"names of {len(names)} training views are {_some(names)} and not all their own: name the cameras as views "
