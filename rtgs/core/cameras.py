@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -84,9 +85,9 @@ class Camera:
                 f"camera {self.name!r}: principal point ({self.cx}, {self.cy}) must be finite; calibrate again"
             )
 
-    @property
+    @cached_property
     def center(self) -> Tensor:
-        """(3,) camera centre in the world frame."""
+        """(3,) camera centre in the world frame; not to be written into: asked again, it is the same tensor."""
         return -self.rotation.T @ self.translation
 
     def to_camera(self, points: Tensor) -> Tensor:

@@ -33,9 +33,10 @@ class Coverage:
         """Of pixels ``wanted`` (P,) int64 those that are here: (E,) places in ``wanted``, (E,) rows."""
         if len(self.pixels) == 0:
             return torch.zeros(2, 0, dtype=torch.int64).unbind(0)  # type: ignore[return-value]
-        place = torch.searchsorted(self.pixels, wanted).clamp_max(len(self.pixels) - 1)
-        here = (self.pixels[place] == wanted).nonzero()[:, 0]
-        return here, place[here]
+        last = max(int(self.pixels[-1]), int(wanted.max()) if len(wanted) else 0)
+        known = torch.zeros(last + 1, dtype=torch.bool).index_fill_(0, self.pixels, True)
+        here = known.index_select(0, wanted).nonzero()[:, 0]  # few: only these are worth a search
+        return here, torch.searchsorted(self.pixels, wanted.index_select(0, here))
 
 
 class CoverageGuide:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from rtgs.core.decisions import Decision
 from rtgs.train.losses import photometric_loss
@@ -106,8 +107,25 @@ class LossTable:
 
 
 def as_the_sensor(image: Tensor, photo: Tensor) -> Tensor:
-    """(3, H, W) the image, no brighter than 1 where the photo is at its brightest value."""
-    return torch.where(photo >= BRIGHTEST, image.clamp_max(1), image)
+    """(3, H, W) the image, no brighter than 1 where the photo is at its brightest value; there is no gradient from what
+    is cut off."""
+    return _AsTheSensor.apply(image, photo)  # type: ignore[return-value]
+
+
+class _AsTheSensor(torch.autograd.Function):
+    """One mask and one copy each way: chained operations of torch make five maps of the picture's size."""
+
+    @staticmethod
+    def forward(ctx, image: Tensor, photo: Tensor) -> Tensor:
+        cut = (photo >= BRIGHTEST).logical_and_(image > 1)
+        ctx.save_for_backward(cut)
+        return image.masked_fill(cut, 1.0)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, upstream: Tensor):  # type: ignore[override]
+        (cut,) = ctx.saved_tensors
+        return upstream.masked_fill(cut, 0.0), None
 
 
 def table_of(settings: LossSettings, terms: Iterable[LossTerm]) -> LossTable:

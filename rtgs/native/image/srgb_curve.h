@@ -16,15 +16,18 @@ static inline vfloat power(vfloat a, float exponent) {
   return select(finite(a), exp2_response(min(exponent * log2(a), broadcast(126.f))), a);
 }
 
-// The line is the other case of "brighter than", so that it hands NaN on.
+// The line is the other case of "brighter than", so that it hands NaN on. Where all lanes are on it, as those of a light
+// that a part of the picture does not have, there is no power to be taken.
 static inline Curve decode_curve(vfloat color) {
-  const vfloat base = max(color, broadcast(kDarkColor)) + kOffset, light = power(base * (1 / (1 + kOffset)), kPower);
   const vmask bright = gt(color, broadcast(kDarkColor));
+  if (!any(bright)) return {color * (1 / kSlope), broadcast(1 / kSlope)};
+  const vfloat base = max(color, broadcast(kDarkColor)) + kOffset, light = power(base * (1 / (1 + kOffset)), kPower);
   return {select(bright, light, color * (1 / kSlope)), select(bright, kPower * light / base, broadcast(1 / kSlope))};
 }
 static inline Curve encode_curve(vfloat light) {
-  const vfloat base = max(light, broadcast(kDarkLight)), raised = (1 + kOffset) * power(base, 1 / kPower);
   const vmask bright = gt(light, broadcast(kDarkLight));
+  if (!any(bright)) return {light * kSlope, broadcast(kSlope)};
+  const vfloat base = max(light, broadcast(kDarkLight)), raised = (1 + kOffset) * power(base, 1 / kPower);
   return {select(bright, raised - kOffset, light * kSlope),
           select(bright, raised / (kPower * base), broadcast(kSlope))};
 }
