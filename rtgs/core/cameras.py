@@ -122,10 +122,14 @@ class Camera:
 
     def rays(self, dtype: torch.dtype = torch.float32) -> Rays:
         """Rays through the pixel centres in the world frame."""
+        across, along = self.ray_tables()
+        return Rays(self.center.to(dtype), (across + along[:, None]).to(dtype))
+
+    def ray_tables(self) -> tuple[Tensor, Tensor]:
+        """(W, 3) and (H, 3) float64, of columns and rows: their sums are the directions of :meth:`rays`."""
         x, y = self._slopes()
         right, down, ahead = self.rotation  # R^T d, row by row and column by column
-        directions = x[:, None] * right + (y[:, None] * down + ahead)[:, None]
-        return Rays(self.center.to(dtype), directions.to(dtype))
+        return x[:, None] * right, y[:, None] * down + ahead
 
     def _slopes(self) -> tuple[Tensor, Tensor]:
         """(W,) and (H,) float64 x / z of the columns' centres and y / z of the rows', in the camera frame."""

@@ -19,6 +19,7 @@ from rtgs.mesh.guide import MeshGuide
 from rtgs.mesh.normals import corner_normals, interpolated, neighbourhood_normals
 from rtgs.mesh.pieces import piece_labels, submesh
 from rtgs.mesh.record import AND, CARVED, RECORD_FILE, MeshRecord
+from rtgs.mesh.spread import ObjectRows, ObjectSurfaces, spread
 from rtgs.mesh.triangles import TriangleMesh, read_mesh_ply, write_mesh_ply
 
 MESH_FILE = "mesh.ply"
@@ -231,18 +232,6 @@ def read_object_mesh(folder: Path) -> ObjectMesh:
 
 
 @dataclass(frozen=True)
-class ObjectSurfaces:
-    """Where the pixels of one camera meet the object; (H, W), no gradient."""
-
-    hit: Tensor  # bool: the silhouette
-    near: Tensor  # float32 z-depth of the first surface; 0 where not hit
-    far: Tensor  # float32 z-depth of the second surface; ``near`` where there is none (thin sheet, open mesh)
-    second: Tensor  # bool: a second surface was found
-    normal: Tensor  # (3, H, W) float32 unit, world frame, smoothed, facing the camera; 0 where not hit
-    triangle: Tensor  # (H, W) int32 of the first surface; -1 where not hit
-
-
-@dataclass(frozen=True)
 class SurfacePoints:
     """Where N rays from one point meet the object; no gradient. Rows that miss it hold nothing else of use."""
 
@@ -269,6 +258,12 @@ class _Cached:
     normal: Tensor  # (3, K) float16
     triangle: Tensor  # (K,) int32
 
+    def rows(self) -> ObjectRows:
+        """With unit normals."""
+        facing = self.normal.float()
+        normal = facing * facing.square().sum(0).clamp_min(1e-12).rsqrt()
+        return ObjectRows(self.pixels, self.near, self.far, self.second, normal, self.triangle)
+
 
 class ObjectGuide:
     """First and second surface of the object for every camera; the last ``cache_views`` cameras are remembered
@@ -290,6 +285,22 @@ class ObjectGuide:
         key = camera_key(camera)
         if self._last is not None and self._last[0] == key:
             return self._last[1]
+        surfaces = spread([self._hit(camera, key).rows()], camera.height, camera.width)
+        self._last = (key, surfaces) if self.cache_views else None
+        return surfaces
+
+    def silhouette(self, camera: Camera) -> Tensor:
+        """(H, W) bool: pixels whose centre meets the object."""
+        found = self._hit(camera, camera_key(camera))
+        hit = torch.zeros(camera.height * camera.width, dtype=torch.bool)
+        return hit.index_fill_(0, found.pixels.long(), True).view(camera.height, camera.width)
+
+    def rows(self, camera: Camera) -> ObjectRows:
+        """The same surfaces, of the hit pixels alone."""
+        return self._hit(camera, camera_key(camera)).rows()
+
+    def _hit(self, camera: Camera, key: tuple[object, ...]) -> _Cached:
+        """Remembered, or cast."""
         found = self._cache.pop(key, None)
         if found is None:
             found = self._cast(camera)
@@ -299,9 +310,7 @@ class ObjectGuide:
             self._cache[key] = found  # the newest is last
             while len(self._cache) > self.cache_views:
                 del self._cache[next(iter(self._cache))]
-        surfaces = _spread(found, camera)
-        self._last = (key, surfaces) if self.cache_views else None
-        return surfaces
+        return found
 
     def counts(self) -> dict[str, int]:
         """Pixels over all cameras asked for so far, each camera once: ``hit``, ``second``, ``one_hit`` (no second)."""
@@ -354,21 +363,6 @@ def _pixels_of_box(camera: Camera, bounds: np.ndarray) -> Tensor:
     y = torch.arange(camera.height)
     x, y = x[(x >= first[0]) & (x <= last[0])], y[(y >= first[1]) & (y <= last[1])]
     return (y[:, None] * camera.width + x[None]).reshape(-1)
-
-
-def _spread(found: _Cached, camera: Camera) -> ObjectSurfaces:
-    size, shape = camera.width * camera.height, (camera.height, camera.width)
-    index = found.pixels.long()
-    hit, second = torch.zeros(size, dtype=torch.bool), torch.zeros(size, dtype=torch.bool)
-    near, far, normal = torch.zeros(size), torch.zeros(size), torch.zeros(3, size)
-    facing = found.normal.float()
-    triangle = torch.full((size,), -1, dtype=torch.int32)
-    hit.index_fill_(0, index, True)
-    for full, own in ((second, found.second), (near, found.near), (far, found.far), (triangle, found.triangle)):
-        full.index_copy_(0, index, own)
-    normal.index_copy_(1, index, facing * facing.square().sum(0).clamp_min(1e-12).rsqrt())
-    maps = (hit.view(shape), near.view(shape), far.view(shape), second.view(shape))
-    return ObjectSurfaces(*maps, normal.view(3, *shape), triangle.view(shape))
 
 
 def camera_key(camera: Camera) -> tuple[object, ...]:

@@ -6,13 +6,14 @@ and at which angles it is met: reflectance rises steeply towards the outline, an
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from rtgs.core.cameras import Camera
-from rtgs.mesh.container import ObjectGuide, ObjectSurfaces, SurfacePoints, camera_key
+from rtgs.mesh.container import ObjectGuide, camera_key
+from rtgs.mesh.spread import ObjectRows, ObjectSurfaces, spread
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,7 @@ class Coverage:
     pixels: Tensor  # (K,) int64 into the flattened image, ascending; some sample of each meets the object
     triangle: Tensor  # (K, S) int32 of the first surface; -1: the sample misses the object
     cosine: Tensor  # (K, S) float32 of the angle of incidence there; 1 where it misses
-    chosen: SurfacePoints  # of K samples: those nearest to the middle of what meets the object
+    beside: ObjectRows  # of those pixels whose centre misses it: the sample nearest to the middle of what meets it
 
     @property
     def share(self) -> Tensor:
@@ -62,26 +63,11 @@ class CoverageGuide:
 
     def surfaces(self, camera: Camera) -> ObjectSurfaces:
         """As the guide's; pixels whose centre misses the object and which show some of it have a sample's."""
-        found, coverage = self.guide.surfaces(camera), self.coverage(camera)
-        missed = (~found.hit.flatten()[coverage.pixels]).nonzero()[:, 0]
-        pixels, chosen = coverage.pixels[missed], coverage.chosen.rows(missed)
-
-        def filled(values: Tensor, more: Tensor) -> Tensor:
-            flat = values.reshape(*values.shape[:-2], -1)
-            return flat.index_copy(-1, pixels, more.to(values.dtype)).reshape(values.shape)
-
-        return replace(
-            found,
-            hit=filled(found.hit, torch.ones(len(pixels))),
-            near=filled(found.near, chosen.near),
-            far=filled(found.far, chosen.far),
-            second=filled(found.second, chosen.second),
-            normal=filled(found.normal, chosen.normal.T),
-            triangle=filled(found.triangle, chosen.triangle),
-        )
+        return spread([self.guide.rows(camera), self.coverage(camera).beside], camera.height, camera.width)
 
     def _sampled(self, camera: Camera) -> Coverage:
-        pixels = _at_outline(self.guide.surfaces(camera).hit).flatten().nonzero()[:, 0]
+        hit = self.guide.silhouette(camera)
+        pixels = _at_outline(hit).flatten().nonzero()[:, 0]
         side, samples = self.side, self.side * self.side
         x, y = pixels % camera.width, pixels // camera.width
         grid = (torch.arange(side, dtype=torch.float64) + 0.5) / side
@@ -95,8 +81,11 @@ class CoverageGuide:
         triangle = torch.where(points.hit, points.triangle, -1).reshape(-1, samples)
         covered = points.hit.reshape(-1, samples)
         some = covered.any(1).nonzero()[:, 0]
-        chosen = some * samples + _in_the_middle(covered[some], grid)
-        return Coverage(pixels[some], triangle[some].int(), cosine.reshape(-1, samples)[some], points.rows(chosen))
+        missed = some[~hit.flatten()[pixels[some]]]
+        near = points.rows(missed * samples + _in_the_middle(covered[missed], grid))
+        shown = (near.near, near.far, near.second, near.normal.T.contiguous(), near.triangle.int())
+        beside = ObjectRows(pixels[missed].int(), *shown)
+        return Coverage(pixels[some], triangle[some].int(), cosine.reshape(-1, samples)[some], beside)
 
 
 def _at_outline(hit: Tensor) -> Tensor:

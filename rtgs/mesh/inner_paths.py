@@ -14,10 +14,11 @@ import torch
 from torch import Tensor
 
 from rtgs.core.cameras import Camera
-from rtgs.mesh.container import ObjectGuide, ObjectMesh, ObjectSurfaces, camera_key
+from rtgs.mesh.container import ObjectGuide, ObjectMesh, camera_key
 from rtgs.mesh.guide import RayHits
 from rtgs.mesh.meetings import Meetings, meetings
 from rtgs.mesh.normals import interpolated
+from rtgs.mesh.spread import ObjectSurfaces
 
 OFF_THE_WALL = 1e-4  # of the object's size: a mirrored ray starts so far inside
 CACHED_BYTES = 512 << 20  # of the paths that are kept

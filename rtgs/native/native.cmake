@@ -47,6 +47,8 @@ set(RTGS_BINDINGS
   bind/blend.cpp
   image/traced_pixels.cpp
   bind/traced_pixels.cpp
+  image/surface.cpp
+  bind/surface.cpp
   bind/wall.cpp
   light/border.cpp
   bind/light.cpp

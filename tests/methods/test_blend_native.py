@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from rtgs.methods.shading.blend import MOST_LIGHTS, Blend, blended, blended_twin
-from rtgs.methods.shading.pixel_maps import taken
-from rtgs.methods.shading.traced_pixels import TracedPixels
+from rtgs.methods.shading.pixel_maps import shown_colors, shown_colors_twin, taken
+from rtgs.methods.shading.traced_pixels import SharedRays, TracedPixels
 from rtgs.native import core
 
 SIZES = ((0, 1), (1, 1), (15, 40), (16, 16), (33, 64), (500, 1200))  # traced pixels, all pixels
@@ -186,6 +186,31 @@ def test_other_numbers_are_taken_by_torch():
     assert torch.equal(taken([values], torch.tensor([3, 1]))[0], torch.tensor([3.0, 1.0], dtype=torch.float64))
 
 
+# ---- colours of rays that pixels share
+
+
+@pytest.mark.parametrize(("pixels", "rays", "more"), [(0, 0, 0), (1, 1, 0), (40, 17, 5), (20_001, 9_000, 700)])
+def test_shared_colours_and_their_gradients_are_those_of_the_twin(pixels: int, rays: int, more: int):
+    generator = torch.Generator().manual_seed(pixels)
+    ray = torch.randint(0, max(rays, 1), (pixels,), generator=generator)
+    shared = SharedRays(torch.arange(rays), ray)
+    values = torch.rand(rays + more, 3, generator=generator)
+    upstream = [torch.randn(shape, generator=generator) for shape in ((3, pixels), (more, 3))]
+    results = []
+    for function in (shown_colors, shown_colors_twin):
+        colors = values.clone().requires_grad_()
+        planes, others = function(colors, rays, shared)
+        results.append([planes.detach(), others.detach(), *torch.autograd.grad((planes, others), colors, upstream)])
+    assert all(torch.equal(one, other) for one, other in zip(*results, strict=True))
+
+
+def test_pixels_with_rays_of_their_own_show_their_colours():
+    colors = torch.rand(7, 3)
+    planes, others = shown_colors(colors, 5, None)
+    assert torch.equal(planes, colors[:5].T)
+    assert torch.equal(others, colors[5:])
+
+
 # ---- what the bindings refuse
 
 
@@ -200,6 +225,10 @@ def test_the_kernels_refuse_what_does_not_fit():
         core.take_planes(np.array([0, 1, 2]), 8, [maps], [rows], 1)
     with pytest.raises(ValueError, match="as many maps as rows"):
         core.take_planes(np.array([0, 1]), 8, [maps], [], 1)
+    with pytest.raises(ValueError, match="names pixel 2 of a picture of 2"):
+        core.show_rays(np.array([0, 2]), rows.reshape(2, 3), rows.reshape(3, 2), 1)
+    with pytest.raises(ValueError, match="planes holds 6 numbers, expected 9"):
+        core.show_rays_backward(np.array([0, 1, 1]), rows, rows.reshape(2, 3))
     index, weight, color = np.array([0, 1]), np.zeros(2, np.float32), np.zeros((3, 2), np.float32)
     image = np.zeros((3, 8), np.float32)
     with pytest.raises(ValueError, match="color holds 3 numbers, expected 6"):

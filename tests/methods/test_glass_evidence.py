@@ -15,7 +15,8 @@ from torch import Tensor
 
 from benchmarks.common.mirror_scene import BALL, RADIUS, ball_hit
 from rtgs.core.cameras import Camera
-from rtgs.mesh.container import ObjectGuide, ObjectSurfaces
+from rtgs.mesh.container import ObjectGuide
+from rtgs.mesh.spread import ObjectSurfaces
 from rtgs.methods import Mode, RenderOptions, Stage
 from rtgs.methods.model import Model
 from rtgs.methods.parts.glass_evidence import glass_faces, near_surface, on_surface, seen_bare

@@ -248,3 +248,14 @@ def test_a_sensor_stops_at_its_brightest_value_and_nowhere_else():
     photo = torch.tensor([[[1.0, 1.0, 0.9, 0.2]]]).expand(3, 1, 4)
     image = torch.tensor([[[1.7, 0.8, 1.7, 0.2]]]).expand(3, 1, 4)
     torch.testing.assert_close(as_the_sensor(image, photo)[0, 0], torch.tensor([1.0, 0.8, 1.7, 0.2]))
+
+
+def test_what_the_sensor_cuts_off_has_no_gradient():
+    generator = torch.Generator().manual_seed(3)
+    photo = torch.randint(0, 2, (3, 4, 5), generator=generator).double()
+    image = (2 * torch.rand(3, 4, 5, generator=generator)).double().requires_grad_()
+    assert torch.autograd.gradcheck(lambda given: as_the_sensor(given, photo), (image,))
+    plain = torch.where(photo >= 254.5 / 255, image.clamp_max(1), image)
+    upstream = torch.randn(3, 4, 5, generator=generator).double()
+    found, expected = (torch.autograd.grad(each, image, upstream)[0] for each in (as_the_sensor(image, photo), plain))
+    assert torch.equal(found, expected)

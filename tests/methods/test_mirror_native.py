@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from rtgs.methods.shading.mirror import SHORTEST_NORMAL, SurfacePixels, mirror_rays, mirror_rays_twin
+from rtgs.methods.shading.mirror import SHORTEST_NORMAL, SentRays, SurfacePixels, mirror_rays, mirror_rays_twin
 from rtgs.optics.microfacet import specular_weights
 from rtgs.optics.reflection import reflection_weight
 from rtgs.optics.settings import OpticsSettings
@@ -51,6 +51,34 @@ def test_mirror_rays_and_their_gradients_are_those_of_the_twin(isa: str, count: 
         gradients = torch.autograd.grad(outputs, (normal, depth), [g.to(dtype) for g in upstream])
         results.append((*outputs, *gradients))
     assert all(close(found.detach(), expected.detach(), 2e-6) for found, expected in zip(*results, strict=True))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.9, 1.0])
+@pytest.mark.parametrize("more", [0, 21])
+@pytest.mark.parametrize("count", COUNTS)
+def test_rays_of_some_pixels_before_others_are_those_of_the_twin(isa: str, count: int, share: float, more: int):
+    pixels, view, center = drawn_pixels(count)
+    generator = torch.Generator().manual_seed(5)
+    own = (torch.rand(count, generator=generator) < share).nonzero()[:, 0]
+    others = torch.randn(2, more, 3, generator=generator)
+    upstream = [torch.randn(shape, generator=generator) for shape in ((len(own) + more, 3),) * 2 + ((count,),)]
+    results = []
+    for dtype, function in ((torch.float32, mirror_rays), (torch.float64, mirror_rays_twin)):
+        leaves = [m.to(dtype).clone().requires_grad_() for m in (pixels.normal, pixels.depth, *others)]
+        given = SurfacePixels(*(m.to(dtype) for m in (pixels.diffuse, *[pixels.specular] * 3)), *leaves[:2])
+        sent = SentRays(own, (leaves[2], leaves[3]) if more else None)
+        rays = function(given, center.to(dtype), view.to(dtype), "unit", sent)
+        outputs = (rays.origins, rays.directions, rays.cosine)
+        asked = leaves if more else leaves[:2]
+        results.append((*outputs, *torch.autograd.grad(outputs, asked, [g.to(dtype) for g in upstream])))
+    assert all(close(found.detach(), expected.detach(), 2e-6) for found, expected in zip(*results, strict=True))
+
+
+@pytest.mark.parametrize("own", [[-1, 2], [0, 8], [3, 3], [4, 2]])
+def test_pixels_that_do_not_ascend_within_the_picture_are_refused(own: list[int]):
+    pixels, view, center = drawn_pixels(8)
+    with pytest.raises(ValueError, match="own must ascend within the 8 pixels"):
+        mirror_rays(pixels, center, view, "unit", SentRays(torch.tensor(own)))
 
 
 @pytest.mark.parametrize("gain", [1.0, 16.0, 0.0])
@@ -103,13 +131,14 @@ def test_the_cosine_can_be_cut_off_natively():
 def test_threads_change_nothing(isa, raw):
     pixels, view, center = drawn_pixels(20_001)
     numbers = torch.rand(3, 20_001, generator=torch.Generator().manual_seed(1))
+    sent = SentRays((numbers[0] < 0.6).nonzero()[:, 0])
     before = torch.get_num_threads()
     found = []
     for threads in (1, 2, 3):
         torch.set_num_threads(threads)
         leaves = [each.clone().requires_grad_() for each in (pixels.normal, pixels.depth, *numbers)]
         given = replace(pixels, normal=leaves[0], depth=leaves[1])
-        rays = mirror_rays(given, center, view, "raw" if raw else "unit")
+        rays = mirror_rays(given, center, view, "raw" if raw else "unit", sent)
         weight = reflection_weight(*leaves[2:], OpticsSettings())
         outputs = (rays.origins, rays.directions, rays.cosine, weight)
         sum((each * each.detach().sin()).sum() for each in outputs).backward()

@@ -70,7 +70,7 @@ def _normal(gradient: np.ndarray) -> None:
 
 def _mirror(cosine: np.ndarray) -> None:
     maps = _floats(4, 3), _floats(4), _floats(4, 3)
-    core.mirror_rays(*maps, (0.0, 0.0, 0.0), 1e-6, False, _floats(4, 3), _floats(4, 3), cosine, 1)
+    core.mirror_rays(*maps, (0.0, 0.0, 0.0), 1e-6, False, None, _floats(4, 3), _floats(4, 3), cosine, 1)
 
 
 def _microfacet(weight: np.ndarray) -> None:

@@ -56,7 +56,7 @@ def _normal(threads: int) -> None:
 
 def _mirror(threads: int) -> None:
     maps = _floats(4, 3), _floats(4), _floats(4, 3)
-    core.mirror_rays(*maps, (0.0, 0.0, 0.0), 1e-6, False, _floats(4, 3), _floats(4, 3), _floats(4), threads)
+    core.mirror_rays(*maps, (0.0, 0.0, 0.0), 1e-6, False, None, _floats(4, 3), _floats(4, 3), _floats(4), threads)
 
 
 def _filter(threads: int) -> None:

@@ -15,8 +15,9 @@ from rtgs.core.decisions import Decision
 from rtgs.core.errors import RtgsError
 from rtgs.gaussians.materials import material_channels
 from rtgs.gaussians.surfels import Surfels
-from rtgs.mesh.container import ObjectGuide, ObjectMesh, ObjectSurfaces
+from rtgs.mesh.container import ObjectGuide, ObjectMesh
 from rtgs.mesh.silhouettes import bounding
+from rtgs.mesh.spread import ObjectSurfaces
 from rtgs.methods.parts.base import BaseSet, composited
 from rtgs.methods.parts.gaussian_set import GaussianSet, densified, opacity_reset
 from rtgs.methods.parts.glass_evidence import glass_faces, kept_in_base, left_out, reason_against
@@ -215,7 +216,7 @@ class Glass(Part):
         bend = None if self.vertices is None else self.vertices.bend(frame.step)
         glass = self.pixels(frame, flat, bend)
         chosen = mirror.choose(frame, raster.buffers, glass.flat, always=glass.inside)
-        straight = glass_rays(glass, chosen.index, rays.center, rays.directions)
+        straight = glass_rays(glass, chosen.index, rays.center, rays.rows)
         if self.wall is not None:
             self.wall.set_for(frame.step if frame.training and frame.step < self.plan.judged else None)
         scatters = [None] if self.wall is None else self.wall.scatters(frame.step if frame.training else None)
@@ -224,7 +225,7 @@ class Glass(Part):
         samples = [self._sample(shown, each) for each in scatters]
         (met, passed, _), lights = samples[0], mean_of_lights([lights for _, _, lights in samples])
         if outline is not None:
-            aside = rays.directions[:, chosen.index[outline.rows[outline.partly]]].T
+            aside = rays.rows(chosen.index[outline.rows[outline.partly]])
             beside = self._straight(frame).beside(rays.center, aside, self.base.sh_degree(frame.step))
             lights = with_beside(lights, met.pixels.specular, outline, beside)
         traced = Traced(
@@ -267,12 +268,11 @@ class Glass(Part):
     def pixels(self, frame: Frame, flat: SurfacePixels, bend: Bend | None = None) -> GlassPixels:
         """The pixels of the view's mask in training, of the silhouette or of given masks else."""
         assert self.guide is not None
-        centers = self.guide.surfaces(frame.camera)
-        surfaces = centers if self.wall is None else self.wall.surfaces(frame.camera)
+        surfaces = (self.wall or self.guide).surfaces(frame.camera)
         if bend is not None and self.vertices is not None:
             surfaces = self.vertices.moved(frame.camera, surfaces, bend)
-        known = self.on_glass(surfaces)
-        made = object_pixels(self.settings.transmittance, frame, flat, surfaces, centers.hit, known)
+        centers, known = self.guide.silhouette(frame.camera), self.on_glass(surfaces)
+        made = object_pixels(self.settings.transmittance, frame, flat, surfaces, centers, known)
         return made if self.wall is None else self.wall.on_glass(made, frame.camera)
 
     def on_glass(self, surfaces: ObjectSurfaces) -> Tensor:
@@ -286,7 +286,7 @@ class Glass(Part):
         bool."""
         settings, optics = self.settings.transmittance, self.settings.optics
         bounded = settings.max_weight > 0 and settings.interface.count > 0
-        cosine, reflection = met.rays.cosine, reflected_weight(met.rays.cosine, met.pixels, optics)
+        cosine, reflection = met.cosine, reflected_weight(met.cosine, met.pixels, optics)
         if self.wall is not None:
             rows = inside.nonzero()[:, 0]
             return self.wall.weights(reflection, cosine, rows, self.wall.walls(camera, pixels[rows]), outline)

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from rtgs.core.decisions import Decision
-from rtgs.mesh.container import ObjectSurfaces
 from rtgs.mesh.silhouettes import bounding
+from rtgs.mesh.spread import ObjectSurfaces
 from rtgs.methods.parts.part import Frame
 from rtgs.methods.settings import TransmittanceSettings
 from rtgs.methods.shading.mirror import SurfacePixels

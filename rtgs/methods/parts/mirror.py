@@ -39,18 +39,18 @@ from rtgs.methods.plans import (
 from rtgs.methods.shading.lights import Light, Traced, lit_view
 from rtgs.methods.shading.mirror import (
     MirrorRays,
+    SentRays,
     SurfacePixels,
     mirror_rays,
     pixel_weights,
     reflected_weight,
     showing_reflection,
-    surface_pixels,
     surface_there,
 )
-from rtgs.methods.shading.pixel_maps import take_pixels
+from rtgs.methods.shading.pixel_maps import shown_colors, take_pixels
+from rtgs.methods.shading.surface_maps import seen_surface
 from rtgs.methods.shading.traced_pixels import TracedPixels, choose_pixels
 from rtgs.render.buffers import RasterBuffers, TraceOptions
-from rtgs.train.losses import surface_depth
 from rtgs.train.method import Mode, Observation, RenderedView, RenderOptions, Stage, StepEvent
 from rtgs.train.parameters import ParameterGroup
 from rtgs.train.schedule import densify_ahead, densify_due, opacity_was_reset, sh_degree_at
@@ -66,7 +66,7 @@ class Reflected:
     """What the mirror rays of P traced pixels met."""
 
     pixels: SurfacePixels  # where they start
-    rays: MirrorRays
+    cosine: Tensor  # (P,) n . omega_o
     color: Tensor  # (3, P) C_r
     observations: tuple[Observation, ...]
     others: Tensor | None = None  # (M, 3) colours that another part's rays met
@@ -189,22 +189,13 @@ class Mirror(Part):
         flat = self.surface(raster.buffers)
         chosen = self.choose(frame, raster.buffers, flat)
         met = self.reflect(frame, chosen, flat)
-        lights = self.lights(met, reflected_weight(met.rays.cosine, met.pixels, self.settings.optics))
+        lights = self.lights(met, reflected_weight(met.cosine, met.pixels, self.settings.optics))
         traced = Traced(flat, chosen, met.pixels, lights, observations=met.observations)
         return lit_view(frame, raster, traced, self.settings.optics)
 
     def surface(self, buffers: RasterBuffers) -> SurfacePixels:
         """Every pixel of the view, flattened."""
-        depth = buffers.alpha if buffers.depth is None else buffers.depth  # unused at ratio 1
-        surface = surface_depth(depth, buffers.alpha, buffers.median_depth, self.settings.render.depth_ratio)
-        assert buffers.normal is not None
-        return surface_pixels(
-            buffers.features.flatten(1),
-            buffers.alpha.flatten(),
-            surface.flatten(),
-            buffers.normal.flatten(1),
-            self.settings.materials,
-        )
+        return seen_surface(buffers, self.settings.render.depth_ratio, self.settings.materials)
 
     @torch.no_grad()
     def choose(
@@ -217,7 +208,7 @@ class Mirror(Part):
         there = surface_there(flat, buffers.alpha.flatten(), settings.smallest_alpha)
         showing = None
         if traced.threshold > 0 or traced.shared_below > 0:
-            showing = showing_reflection(flat, frame.rays.directions, self.settings.optics)
+            showing = showing_reflection(flat, lambda: frame.rays.directions, self.settings.optics)
             showing = showing if always is None else showing.masked_fill(always, torch.inf)
             showing = showing.reshape(buffers.alpha.shape)
         generator = self.generator if frame.training else None
@@ -234,24 +225,19 @@ class Mirror(Part):
         """Trace the mirror rays of the chosen pixels, and ``more`` rays of another part: origins, directions (M, 3).
         ``bent``: those of rough surfaces in the place of smooth ones."""
         assert self.set is not None
-        pixels = take_pixels(flat, chosen.index)
-        view = frame.rays.directions.index_select(1, chosen.index)
-        rays = mirror_rays(pixels, frame.rays.center, view, self.settings.reflection.sh_direction)
-        rays = rays if bent is None else bent(rays, pixels)
+        pixels = take_pixels(flat, chosen.index, diffuse=self._coated)
+        start = (pixels, frame.rays.center, frame.rays.planes(chosen.index), self.settings.reflection.sh_direction)
+        sent = SentRays(None if chosen.shared is None else chosen.shared.own, more)
+        rays = mirror_rays(*start, sent) if bent is None else sent.of(bent(mirror_rays(*start), pixels))
         ahead = self.set.density.needs_signal and densify_ahead(self.plan.reflection, frame.step)
         watched = frame.training and ahead
-        origins, directions = rays.origins, rays.directions
-        if chosen.shared is not None:
-            origins, directions = (rows.index_select(0, chosen.shared.own) for rows in (origins, directions))
-        options, own = self.trace_options(frame.step, watched), len(origins)
-        if more is not None:
-            origins, directions = torch.cat((origins, more[0])), torch.cat((directions, more[1]))
-        traced, observations = self.set.trace(origins, directions, options, watched=watched)
+        options = self.trace_options(frame.step, watched)
+        traced, observations = self.set.trace(rays.origins, rays.directions, options, watched=watched)
         assert traced.colors is not None
-        colors = self.over_sky(traced.colors, traced.alpha, directions)
-        colors, others = (colors, None) if more is None else (colors[:own], colors[own:])
-        color = (colors if chosen.shared is None else colors.index_select(0, chosen.shared.ray)).T
-        return Reflected(pixels, rays, color, observations, others)
+        colors = self.over_sky(traced.colors, traced.alpha, rays.directions)
+        own = len(colors) - (0 if more is None else len(more[0]))
+        color, others = shown_colors(colors, own, chosen.shared)
+        return Reflected(pixels, rays.cosine, color, observations, None if more is None else others)
 
     def over_sky(self, colors: Tensor, alpha: Tensor, directions: Tensor) -> Tensor:
         """(R, 3) colours of rays along ``directions`` (R, 3) with what is seen where they meet nothing; ``alpha`` (R,)
@@ -271,11 +257,16 @@ class Mirror(Part):
 
         ``bare``: (P,) bool of pixels that have none, whatever the settings; None: there are no such pixels.
         """
-        if self.settings.optics.fresnel != "coated":
+        if not self._coated:
             return (met.light(weight),)
-        passed = pixel_weights(met.rays.cosine, met.pixels, self.settings.optics).transmission
+        passed = pixel_weights(met.cosine, met.pixels, self.settings.optics).transmission
         passed = passed if bare is None else passed.masked_fill(bare, 0.0)
         return met.light(weight), Light("coated", "coated_color", passed, met.pixels.diffuse)
+
+    @property
+    def _coated(self) -> bool:
+        """The surface shows its own colour under a coat that mirrors."""
+        return self.settings.optics.fresnel == "coated"
 
     def trace_options(self, step: int, watched: bool) -> TraceOptions:
         """How mirror rays are traced at ``step``; ``watched``: with the sums that density control needs."""

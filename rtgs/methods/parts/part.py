@@ -15,6 +15,7 @@ from rtgs.core.errors import RtgsError
 from rtgs.gaussians.surfels import ActivatedGaussians
 from rtgs.render.buffers import RasterBuffers
 from rtgs.render.pose import Pose
+from rtgs.render.rays import RayTables, taken_rays
 from rtgs.train.method import Mode, Observation, RenderedView, RenderOptions, Stage, StepEvent
 
 if TYPE_CHECKING:
@@ -52,16 +53,36 @@ class Frame:
                 f"the pose of view {self.camera.name!r} is learned (method.poses.enabled), but this method traces rays "
                 "from its pixels, and they give no gradient of it: set it to false"
             )
-        found = self.camera.rays()
-        return ViewRays(found.origin, found.directions.reshape(-1, 3).T)
+        return ViewRays(self.camera)
 
 
 @dataclass(frozen=True)
 class ViewRays:
-    """One ray for each of H * W pixels, row by row."""
+    """One ray for each of H * W pixels, row by row; float32."""
 
-    center: Tensor  # (3,) world
-    directions: Tensor  # (3, H * W) world, camera-z component 1
+    camera: Camera
+
+    @cached_property
+    def center(self) -> Tensor:
+        """(3,) world."""
+        return self.camera.center.float()
+
+    @cached_property
+    def directions(self) -> Tensor:
+        """(3, H * W) world, camera-z component 1."""
+        return self.camera.rays().directions.reshape(-1, 3).T
+
+    @cached_property
+    def _tables(self) -> RayTables:
+        return self.camera.ray_tables()
+
+    def planes(self, pixels: Tensor) -> Tensor:
+        """(3, P) directions of flattened pixels (P,)."""
+        return taken_rays(self._tables, pixels, rows=False)
+
+    def rows(self, pixels: Tensor) -> Tensor:
+        """(P, 3) directions of flattened pixels (P,)."""
+        return taken_rays(self._tables, pixels, rows=True)
 
 
 @dataclass(frozen=True)

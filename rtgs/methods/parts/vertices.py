@@ -19,13 +19,14 @@ from torch import Tensor
 
 from rtgs.core.cameras import Camera
 from rtgs.core.decisions import Decision
-from rtgs.mesh.container import ObjectGuide, ObjectMesh, ObjectSurfaces, camera_key
+from rtgs.mesh.container import ObjectGuide, ObjectMesh, camera_key
 from rtgs.mesh.displacement import Displacement, SparseMap
 from rtgs.mesh.meetings import Meetings, meetings
 from rtgs.mesh.outlines import plain_outlines, refined_outlines
 from rtgs.mesh.record import AND
 from rtgs.mesh.rims import RimView, find_rims, rim_views
 from rtgs.mesh.silhouettes import MaskView, mask_set
+from rtgs.mesh.spread import ObjectSurfaces
 from rtgs.methods.settings import VertexSettings
 from rtgs.methods.shading.bent import Bend, seen_wall
 from rtgs.train.parameters import ParameterGroup, Rate

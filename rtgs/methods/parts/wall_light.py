@@ -13,13 +13,15 @@ from torch import Tensor
 
 from rtgs.core.cameras import Camera
 from rtgs.core.decisions import Decision
-from rtgs.mesh.container import ObjectGuide, ObjectSurfaces
+from rtgs.mesh.container import ObjectGuide
 from rtgs.mesh.coverage import CoverageGuide
 from rtgs.mesh.inner_paths import InnerGuide, InnerPaths
+from rtgs.mesh.spread import ObjectSurfaces
 from rtgs.methods.parts.openings import Openings, judged_openings, upward_parts
 from rtgs.methods.parts.rough_walls import Scatter
 from rtgs.methods.shading.outline import Outline, covering
 from rtgs.methods.shading.straight import GlassPixels, GlassRays
+from rtgs.methods.shading.surface_maps import with_mesh
 from rtgs.optics.dielectric import passed, wall_reflectance
 from rtgs.optics.settings import WallSettings
 from rtgs.train.parameters import ParameterGroup, Rate
@@ -208,15 +210,14 @@ class WallLight:
     def on_glass(self, glass: GlassPixels, camera: Camera) -> GlassPixels:
         """The pixels whose first surface is known to be glass, with all of their k_s: 1 where nothing else covers
         them."""
-        specular = (glass.flat.specular / self.settings.cover).clamp_max(1)
+        flat = with_mesh(glass.flat, glass.known, None, None, self.settings.cover)
         if self._coverage is not None:
             found = self._coverage.coverage(camera)
             shown = (glass.known & glass.inside)[found.pixels]  # as outline() has it: elsewhere nothing shows the rest
             pixels, share = found.pixels[shown], found.share[shown]
             own = covering(glass.flat.specular[pixels], share, self.settings.cover)
-            specular = specular.index_copy(0, pixels, own)
-        specular = torch.where(glass.known, specular, glass.flat.specular)
-        return replace(glass, flat=replace(glass.flat, specular=specular))
+            flat = replace(flat, specular=flat.specular.index_copy(0, pixels, own))
+        return replace(glass, flat=flat)
 
     def outline(self, camera: Camera, pixels: Tensor, glass: GlassPixels) -> Outline | None:
         """Of the traced flattened ``pixels`` (P,), those at the outline that are glass; None: there are none."""

@@ -7,6 +7,7 @@ step is differentiable, so the reflection's loss teaches the surface its normals
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -15,6 +16,7 @@ from torch.autograd.function import once_differentiable
 
 from rtgs.gaussians.settings import MaterialSettings
 from rtgs.native import core
+from rtgs.native.arrays import arrays_of
 from rtgs.native.threads import threads
 from rtgs.optics.light import decoded, encoded
 from rtgs.optics.microfacet import SpecularWeights, specular_weights
@@ -38,11 +40,31 @@ class SurfacePixels:
 
 @dataclass(frozen=True)
 class MirrorRays:
-    """P rays that leave the surface at the mirror direction."""
+    """R rays that leave the surface at the mirror direction, one for each of P pixels unless asked for otherwise."""
 
-    origins: Tensor  # (P, 3) world
-    directions: Tensor  # (P, 3) unit, unless asked for otherwise
+    origins: Tensor  # (R, 3) world
+    directions: Tensor  # (R, 3) unit, unless asked for otherwise
     cosine: Tensor  # (P,) n . omega_o
+
+
+@dataclass(frozen=True)
+class SentRays:
+    """Which mirror rays are wanted, and which other rays are to stand behind them."""
+
+    own: Tensor | None = None  # (R,) int64, ascending: the pixels whose ray it is; None: all of them
+    more: tuple[Tensor, Tensor] | None = None  # (M, 3) origins and directions of other rays
+
+    def of(self, rays: MirrorRays) -> MirrorRays:
+        """Those of the ``rays`` of all pixels, with the others behind them; plain torch."""
+        origins, directions = rays.origins, rays.directions
+        if self.own is not None:
+            origins, directions = origins.index_select(0, self.own), directions.index_select(0, self.own)
+        if self.more is not None:
+            origins, directions = torch.cat((origins, self.more[0])), torch.cat((directions, self.more[1]))
+        return MirrorRays(origins, directions, rays.cosine)
+
+
+EVERY = SentRays()
 
 
 def surface_pixels(
@@ -64,19 +86,24 @@ def surface_pixels(
     return SurfacePixels(diffuse, specular, roughness, f0, normal, depth)
 
 
-def mirror_rays(pixels: SurfacePixels, center: Tensor, view: Tensor, length: str = "unit") -> MirrorRays:
+def mirror_rays(
+    pixels: SurfacePixels, center: Tensor, view: Tensor, length: str = "unit", sent: SentRays = EVERY
+) -> MirrorRays:
     """Reflect the pixels' rays (3, P), camera-z component 1, from the camera at ``center`` (3,) world.
 
     ``length`` of the mirror rays: "unit", or "raw": as long as the ray they come from (decision 23).
     """
-    maps = (pixels.normal, pixels.depth, view, center)
+    more = (None, None) if sent.more is None else sent.more
+    maps = (pixels.normal, pixels.depth, view, center, *(each for each in more if each is not None))
     if all(m.dtype == torch.float32 and m.device.type == "cpu" for m in maps):
         numbers = (tuple(center.tolist()), SHORTEST_NORMAL, length == "raw")
-        return MirrorRays(*_Mirror.apply(pixels.normal, pixels.depth, view, numbers))  # type: ignore[misc]
-    return mirror_rays_twin(pixels, center, view, length)
+        return MirrorRays(*_Mirror.apply(pixels.normal, pixels.depth, view, *more, sent.own, numbers))  # type: ignore[misc]
+    return mirror_rays_twin(pixels, center, view, length, sent)
 
 
-def mirror_rays_twin(pixels: SurfacePixels, center: Tensor, view: Tensor, length: str = "unit") -> MirrorRays:
+def mirror_rays_twin(
+    pixels: SurfacePixels, center: Tensor, view: Tensor, length: str = "unit", sent: SentRays = EVERY
+) -> MirrorRays:
     """:func:`mirror_rays` in plain torch, any dtype."""
     length_of_view = view.square().sum(0).sqrt()  # over three rows, many times faster than norm(dim=0)
     outward = -view / length_of_view  # omega_o
@@ -85,7 +112,7 @@ def mirror_rays_twin(pixels: SurfacePixels, center: Tensor, view: Tensor, length
     directions = 2 * cosine * normal - outward
     directions = directions * length_of_view if length == "raw" else directions
     origins = center[:, None] + pixels.depth * view
-    return MirrorRays(origins.T.contiguous(), directions.T.contiguous(), cosine)
+    return sent.of(MirrorRays(origins.T.contiguous(), directions.T.contiguous(), cosine))
 
 
 def pixel_weights(cosine: Tensor, pixels: SurfacePixels, optics: OpticsSettings) -> SpecularWeights:
@@ -109,10 +136,12 @@ def surface_there(pixels: SurfacePixels, alpha: Tensor, smallest_alpha: float) -
     return there & (pixels.normal.square().sum(0) > SHORTEST_NORMAL**2)
 
 
-def showing_reflection(pixels: SurfacePixels, view: Tensor, optics: OpticsSettings) -> Tensor:
-    """(P,) k_s max(w_r, 1): how much of a reflection each pixel may show; ``view`` (3, P) world rays."""
+def showing_reflection(pixels: SurfacePixels, rays: Callable[[], Tensor], optics: OpticsSettings) -> Tensor:
+    """(P,) k_s max(w_r, 1): how much of a reflection each pixel may show; ``rays``: gives the (3, P) world rays, where
+    they are looked at."""
     if optics.at_most_one:
         return pixels.specular
+    view = rays()
     unit = pixels.normal / pixels.normal.square().sum(0).sqrt().clamp_min(SHORTEST_NORMAL)
     cosine = -(unit * view).sum(0) / view.square().sum(0).sqrt()
     weight = pixel_weights(cosine, pixels, optics).reflection
@@ -159,22 +188,32 @@ class _Emphasize(torch.autograd.Function):
 
 
 class _Mirror(torch.autograd.Function):
+    """Rays of the pixels are written where they are sent from, before the other rays."""
+
     @staticmethod
-    def forward(ctx, normal: Tensor, depth: Tensor, view: Tensor, numbers: tuple[tuple[float, ...], float, bool]):
+    def forward(ctx, normal: Tensor, depth: Tensor, view: Tensor, *given):
+        *more, own, numbers = given
         maps = [m.detach().contiguous() for m in (normal, depth, view)]
-        count = len(depth)
-        outputs = (torch.empty(count, 3), torch.empty(count, 3), torch.empty(count))
-        arrays = [m.numpy() for m in maps]
-        core.mirror_rays(*arrays, *numbers, *(o.numpy() for o in outputs), threads())
-        ctx.save_for_backward(*maps)
-        ctx.numbers = numbers
-        return outputs
+        count, rays = len(depth), len(depth if own is None else own)
+        both = tuple(torch.empty(rays + (0 if each is None else len(each)), 3) for each in more)
+        for sent, each in zip(both, more, strict=True):
+            if each is not None:
+                sent[rays:] = each.detach()
+        cosine = torch.empty(count)
+        places = arrays_of(own, *(sent[:rays] for sent in both), cosine)
+        core.mirror_rays(*arrays_of(*maps), *numbers, *places, threads())
+        ctx.save_for_backward(*maps, own)
+        ctx.numbers, ctx.rays = numbers, rays
+        return *both, cosine
 
     @staticmethod
     @once_differentiable
     def backward(ctx, *upstream: Tensor):  # type: ignore[override]
-        maps = [m.numpy() for m in ctx.saved_tensors]
-        normal, depth = (torch.empty_like(m) for m in ctx.saved_tensors[:2])
-        given = (g.contiguous().numpy() for g in upstream)
-        core.mirror_rays_backward(*maps, *ctx.numbers, *given, normal.numpy(), depth.numpy(), threads())
-        return normal, depth, None, None
+        *maps, own = ctx.saved_tensors
+        normal, depth = (torch.empty_like(m) for m in maps[:2])
+        *both, to_cosine = upstream
+        given = arrays_of(own, *(each[: ctx.rays] for each in both), to_cosine)
+        core.mirror_rays_backward(*arrays_of(*maps), *ctx.numbers, *given, *arrays_of(normal, depth), threads())
+        wanted = zip(both, ctx.needs_input_grad[3:5], strict=True)
+        more = (each[ctx.rays :] if needed else None for each, needed in wanted)
+        return normal, depth, None, *more, None, None

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from rtgs.methods.shading.mirror import SurfacePixels
-from rtgs.methods.shading.traced_pixels import TracedPixels
+from rtgs.methods.shading.traced_pixels import SharedRays, TracedPixels
 from rtgs.native import core
 from rtgs.native.arrays import arrays_of
 from rtgs.native.threads import threads
@@ -20,10 +20,12 @@ def full_map(values: Tensor, chosen: TracedPixels, shape) -> Tensor:
     return torch.zeros(3, shape[1] * shape[2]).index_copy(1, chosen.index, values).reshape(shape)
 
 
-def take_pixels(pixels: SurfacePixels, index: Tensor) -> SurfacePixels:
-    """The pixels of an index (P,), none twice."""
-    maps = (pixels.diffuse, pixels.specular, pixels.roughness, pixels.f0, pixels.normal, pixels.depth)
-    return SurfacePixels(*taken(maps, index))
+def take_pixels(pixels: SurfacePixels, index: Tensor, *, diffuse: bool = True) -> SurfacePixels:
+    """The pixels of an index (P,), none twice. Without ``diffuse``, which few read, theirs is (3, 0)."""
+    maps = (pixels.specular, pixels.roughness, pixels.f0, pixels.normal, pixels.depth)
+    if diffuse:
+        return SurfacePixels(*taken((pixels.diffuse, *maps), index))
+    return SurfacePixels(pixels.diffuse.new_empty(3, 0), *taken(maps, index))
 
 
 def taken(maps: Sequence[Tensor], index: Tensor) -> tuple[Tensor, ...]:
@@ -31,6 +33,26 @@ def taken(maps: Sequence[Tensor], index: Tensor) -> tuple[Tensor, ...]:
     if all(each.dtype == torch.float32 and each.device.type == "cpu" for each in maps):
         return _Taken.apply(index, *maps)  # type: ignore[return-value]
     return tuple(each.index_select(-1, index) for each in maps)
+
+
+def shown_colors(colors: Tensor, rays: int, shared: SharedRays | None) -> tuple[Tensor, Tensor]:
+    """(3, P) colours that pixels show, and (M, 3) those of other rays; any dtype, float32 natively.
+
+    Args:
+        colors: (R + M, 3) of the R ``rays`` of pixels and of M others behind them.
+        rays: R.
+        shared: whose ray each pixel shows; None: P is R, and each its own.
+    """
+    if shared is None:
+        return colors[:rays].T, colors[rays:]
+    if colors.dtype == torch.float32 and colors.device.type == "cpu":
+        return _Shown.apply(colors, rays, shared.ray)  # type: ignore[return-value]
+    return shown_colors_twin(colors, rays, shared)
+
+
+def shown_colors_twin(colors: Tensor, rays: int, shared: SharedRays) -> tuple[Tensor, Tensor]:
+    """:func:`shown_colors` of shared rays in plain torch."""
+    return colors[:rays].index_select(0, shared.ray).T, colors[rays:]
 
 
 def surface_layers(flat: SurfacePixels, chosen: TracedPixels, shape) -> dict[str, Tensor]:
@@ -69,3 +91,24 @@ class _Taken(torch.autograd.Function):
         if filled:
             core.put_planes(*arrays_of(index), filled[0].shape[-1], arrays_of(*rows), arrays_of(*filled), threads())
         return None, *maps
+
+
+class _Shown(torch.autograd.Function):
+    """Colours of rays as planes of the pixels, and those of other rays; the gradient is put together once."""
+
+    @staticmethod
+    def forward(ctx, colors: Tensor, rays: int, ray: Tensor):
+        planes = colors.new_empty(3, len(ray))
+        core.show_rays(*arrays_of(ray, colors[:rays], planes), threads())
+        ctx.save_for_backward(ray)
+        ctx.shape, ctx.rays = colors.shape, rays
+        return planes, colors[rays:].clone()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, to_planes: Tensor, to_others: Tensor):  # type: ignore[override]
+        (ray,) = ctx.saved_tensors
+        colors = to_planes.new_empty(ctx.shape)
+        core.show_rays_backward(*arrays_of(ray, to_planes, colors[: ctx.rays]))
+        colors[ctx.rays :] = to_others
+        return colors, None, None

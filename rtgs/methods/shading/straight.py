@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 
-from rtgs.mesh.container import ObjectSurfaces
+from rtgs.mesh.spread import ObjectSurfaces
 from rtgs.methods.shading.mirror import SHORTEST_NORMAL, SurfacePixels, pixel_weights
+from rtgs.methods.shading.surface_maps import with_mesh
 from rtgs.optics.settings import OpticsSettings
 from rtgs.train.method import Observation
 
@@ -80,10 +81,8 @@ def glass_pixels(
     """
     inside, met = inside.flatten(), inside.flatten() & surfaces.hit.flatten()
     known = met & glass.flatten()
-    if first_surface == "mesh":
-        flat = replace(flat, depth=torch.where(known, surfaces.near.flatten(), flat.depth))
-    if normal == "mesh":
-        flat = replace(flat, normal=torch.where(known, surfaces.normal.flatten(1), flat.normal))
+    depths = surfaces.near.flatten() if first_surface == "mesh" else None
+    flat = with_mesh(flat, known, depths, surfaces.normal.flatten(1) if normal == "mesh" else None)
     near, second = flat.depth.detach(), surfaces.second.flatten() & met
     # A mesh away from the rasterised surface must not put the back before the front.
     far = torch.where(second, torch.maximum(surfaces.far.flatten(), near), near)
@@ -102,12 +101,13 @@ def widened(inside: Tensor, pixels: int) -> Tensor:
     return inside
 
 
-def glass_rays(glass: GlassPixels, index: Tensor, center: Tensor, view: Tensor) -> GlassRays:
-    """The straight rays of the traced pixels ``index`` (P,) that show the object; ``view`` (3, H * W) world rays."""
+def glass_rays(glass: GlassPixels, index: Tensor, center: Tensor, view: Callable[[Tensor], Tensor]) -> GlassRays:
+    """The straight rays of the traced pixels ``index`` (P,) that show the object; ``view``: (R, 3) world rays of
+    flattened pixels (R,)."""
     rows = glass.inside.index_select(0, index).nonzero()[:, 0]
     pixels = index.index_select(0, rows)
     near, far, second = (each.index_select(0, pixels) for each in (glass.flat.depth.detach(), glass.far, glass.second))
-    return GlassRays(rows, len(index), center, view.T.index_select(0, pixels), near, far, second)
+    return GlassRays(rows, len(index), center, view(pixels), near, far, second)
 
 
 def glass_weights(

@@ -43,6 +43,7 @@ void bind_split_sum(nb::module_& m);
 void bind_srgb(nb::module_& m);
 void bind_blend(nb::module_& m);
 void bind_traced_pixels(nb::module_& m);
+void bind_surface(nb::module_& m);
 void bind_wall(nb::module_& m);
 void bind_light(nb::module_& m);
 void bind_features(nb::module_& m);

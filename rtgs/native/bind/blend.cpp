@@ -80,9 +80,42 @@ BlendedPixels given_pixels(const TracedIndex& at, const Floats& diffuse, const F
                         Arrays(colors.begin(), colors.end()));
 }
 
+using Doubles = nb::ndarray<const double, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+
+void take_rays_of(Index index, Doubles across, Doubles along, bool rows, Floats directions, int threads) {
+  if (across.shape(1) != 3 || along.shape(1) != 3) throw std::invalid_argument("rays: tables have three columns");
+  const int64_t width = int64_t(across.shape(0));
+  const TracedIndex at = traced_index(index, width * int64_t(along.shape(0)), threads);
+  require("rays", directions, "directions", 3 * at.count);
+  nb::gil_scoped_release release;
+  take_rays(at, {width, across.data(), along.data()}, rows, directions.data());
+}
+
+ShownRays shown_rays(const Index& ray, const Floats& colors, const Floats& planes) {
+  const TracedIndex at = traced_index(ray, int64_t(colors.size()) / 3, 1);  // checked
+  require("shared rays", colors, "colors", 3 * at.pixels);
+  require("shared rays", planes, "planes", 3 * at.count);
+  return {at.count, at.pixels, at.index};
+}
+
 }  // namespace
 
 void bind_blend(nb::module_& m) {
+  m.def("take_rays", &take_rays_of, nb::arg("index"), nb::arg("across"), nb::arg("along"), nb::arg("rows"),
+        nb::arg("directions"), nb::arg("threads"),
+        "Fills directions, (P, 3) if rows and (3, P) else, of the rays through the pixels of the index (P).");
+  m.def("show_rays", [](Index ray, Floats colors, Floats planes, int threads) {
+    const ShownRays shown = shown_rays(ray, colors, planes);
+    const int checked = checked_threads(threads);
+    nb::gil_scoped_release release;
+    show_rays(shown, colors.data(), planes.data(), checked);
+  }, nb::arg("ray"), nb::arg("colors"), nb::arg("planes"), nb::arg("threads"),
+     "Fills planes (3, P) with the colours (R, 3) of the rays (P) that pixels show.");
+  m.def("show_rays_backward", [](Index ray, Floats planes, Floats colors) {
+    const ShownRays shown = shown_rays(ray, colors, planes);
+    nb::gil_scoped_release release;
+    show_rays_backward(shown, planes.data(), colors.data());
+  }, nb::arg("ray"), nb::arg("planes"), nb::arg("colors"), "Fills the gradient (R, 3) by the colours.");
   m.def("take_planes", [](Index index, int64_t pixels, Planes maps, Planes rows, int threads) {
     const TracedIndex at = traced_index(index, pixels, threads);
     const PlaneList list(maps, rows, at);

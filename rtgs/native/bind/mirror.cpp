@@ -1,5 +1,7 @@
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 
+#include <optional>
 #include <stdexcept>
 #include <string>
 #include <tuple>
@@ -20,20 +22,30 @@ void require(const Floats& a, const char* name, size_t size) {
 
 using Center = std::tuple<float, float, float>;
 
+using Own = std::optional<nb::ndarray<const int64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>>;
+
+void check_own(const int64_t* own, int64_t rays, int64_t pixels) {
+  bool ascends = rays == 0 || (own[0] >= 0 && own[rays - 1] < pixels);
+  for (int64_t ray = 1; ray < rays; ++ray) ascends &= own[ray - 1] < own[ray];
+  if (!ascends)
+    throw std::invalid_argument("mirror: own must ascend within the " + std::to_string(pixels) + " pixels");
+}
+
 MirrorPixels mirror_pixels(const Floats& normal, const Floats& depth, const Floats& view, const Center& center,
-                           float shortest_normal, bool raw, int threads) {
+                           float shortest_normal, bool raw, const Own& own, int threads) {
   const size_t count = depth.size();
   require(normal, "normal", 3 * count);
   require(view, "view", 3 * count);
+  if (own) check_own(own->data(), int64_t(own->size()), int64_t(count));
   const auto [x, y, z] = center;
   return {int64_t(count), normal.data(), depth.data(), view.data(), {x, y, z}, shortest_normal, raw,
-          checked_threads(threads)};
+          checked_threads(threads), int64_t(own ? own->size() : count), own ? own->data() : nullptr};
 }
 
-MirrorRays rays_of(const Floats& origins, const Floats& directions, const Floats& cosine, size_t count) {
-  require(origins, "origins", 3 * count);
-  require(directions, "directions", 3 * count);
-  require(cosine, "cosine", count);
+MirrorRays rays_of(const Floats& origins, const Floats& directions, const Floats& cosine, const MirrorPixels& pixels) {
+  require(origins, "origins", size_t(3 * pixels.rays));
+  require(directions, "directions", size_t(3 * pixels.rays));
+  require(cosine, "cosine", size_t(pixels.count));
   return {origins.data(), directions.data(), cosine.data()};
 }
 
@@ -49,26 +61,27 @@ MicrofacetPixels microfacet_pixels(const Floats& cosine, const Floats& roughness
 
 void bind_mirror(nb::module_& m) {
   m.def("mirror_rays", [](Floats normal, Floats depth, Floats view, Center center, float shortest_normal, bool raw,
-                          Floats origins, Floats directions, Floats cosine, int threads) {
-    const MirrorPixels in = mirror_pixels(normal, depth, view, center, shortest_normal, raw, threads);
-    const MirrorRays out = rays_of(origins, directions, cosine, depth.size());
+                          Own own, Floats origins, Floats directions, Floats cosine, int threads) {
+    const MirrorPixels in = mirror_pixels(normal, depth, view, center, shortest_normal, raw, own, threads);
+    const MirrorRays out = rays_of(origins, directions, cosine, in);
     nb::gil_scoped_release release;
     RTGS_DISPATCH(mirror_rays, in, out);
   }, nb::arg("normal"), nb::arg("depth"), nb::arg("view"), nb::arg("center"), nb::arg("shortest_normal"), nb::arg("raw"),
-     nb::arg("origins"), nb::arg("directions"), nb::arg("cosine"), nb::arg("threads"),
-     "Fills origins, directions (P, 3) and cosine (P) of the mirror rays of P pixels; see rtgs/methods/shading/mirror.py.");
+     nb::arg("own").none(), nb::arg("origins"), nb::arg("directions"), nb::arg("cosine"), nb::arg("threads"),
+     "Fills origins, directions (R, 3) of the mirror rays of the pixels own (R), None: of all P, and cosine (P); see "
+     "rtgs/methods/shading/mirror.py.");
   m.def("mirror_rays_backward", [](Floats normal, Floats depth, Floats view, Center center, float shortest_normal,
-                                   bool raw, Floats to_origins, Floats to_directions, Floats to_cosine,
-                                   Floats to_normal, Floats to_depth, int threads) {
-    const MirrorPixels in = mirror_pixels(normal, depth, view, center, shortest_normal, raw, threads);
-    const MirrorRays upstream = rays_of(to_origins, to_directions, to_cosine, depth.size());
+                                   bool raw, Own own, Floats to_origins, Floats to_directions,
+                                   Floats to_cosine, Floats to_normal, Floats to_depth, int threads) {
+    const MirrorPixels in = mirror_pixels(normal, depth, view, center, shortest_normal, raw, own, threads);
+    const MirrorRays upstream = rays_of(to_origins, to_directions, to_cosine, in);
     require(to_normal, "gradient of normal", normal.size());
     require(to_depth, "gradient of depth", depth.size());
     const MirrorPixelGradients out = {to_normal.data(), to_depth.data()};
     nb::gil_scoped_release release;
     RTGS_DISPATCH(mirror_rays_backward, in, upstream, out);
   }, nb::arg("normal"), nb::arg("depth"), nb::arg("view"), nb::arg("center"), nb::arg("shortest_normal"), nb::arg("raw"),
-     nb::arg("to_origins"), nb::arg("to_directions"), nb::arg("to_cosine"), nb::arg("to_normal"), nb::arg("to_depth"),
+     nb::arg("own").none(), nb::arg("to_origins"), nb::arg("to_directions"), nb::arg("to_cosine"), nb::arg("to_normal"), nb::arg("to_depth"),
      nb::arg("threads"), "Fills the gradients by normal and depth from those of the three outputs.");
   m.def("microfacet_reflection", [](Floats cosine, Floats roughness, Floats f0, float cosine_floor,
                                     float roughness_floor, float bound, Floats weight, int threads) {

@@ -39,6 +39,21 @@ struct PixelPlanes {
 void take_planes(const TracedIndex&, const PixelPlanes&);
 void put_planes(const TracedIndex&, const PixelPlanes&);
 
+// Directions of the rays through the pixels of the index: the sum of what column and row say.
+struct RayTables {
+  int64_t width;
+  const double *across, *along;  // (width, 3), (rows, 3)
+};
+void take_rays(const TracedIndex&, const RayTables&, bool rows, float* directions);  // (P, 3) if `rows`, else (3, P)
+
+// Colours of R rays for the P pixels that show them, `ray` (P) says which, 0 .. R - 1; and the gradient by the rays'.
+struct ShownRays {
+  int64_t pixels, rays;  // P, R
+  const int64_t* ray;
+};
+void show_rays(const ShownRays&, const float* colors /* (R, 3) */, float* planes /* (3, P) */, int threads);
+void show_rays_backward(const ShownRays&, const float* planes, float* colors);  // sums in the order of the pixels
+
 #define RTGS_DECLARE_BLEND_KERNELS(isa)                                                                        \
   namespace isa {                                                                                              \
   void blend_lights(const TracedIndex&, const BlendRules&, const BlendedPixels&, float* image);                \

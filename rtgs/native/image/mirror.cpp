@@ -28,11 +28,73 @@ struct Surface {  // of kLanes pixels
   }
 };
 
+// Which rays of those that are sent leave kLanes pixels.
+class SentRays {
+ public:
+  SentRays(const MirrorPixels& in, int64_t first, int lanes, int64_t ray)  // ray: the first of these pixels or later ones
+      : own_(in.own), first_(first), lanes_(lanes), begin_(ray), end_(ray) {
+    if (own_)
+      while (end_ < in.rays && own_[end_] < first + lanes) ++end_;
+  }
+  int64_t end() const { return end_; }
+  void put(float* rows, const Vector& a) const {
+    if (!own_) return store_vectors(rows, first_, lanes_, a);
+    if (end_ - begin_ == kLanes) return store_vectors(rows, begin_, kLanes, a);
+    float each[3 * kLanes];
+    store_rows<3>(each, a.v);
+    for (int64_t ray = begin_; ray < end_; ++ray) copy(rows + 3 * ray, each + 3 * (own_[ray] - first_));
+  }
+  Vector get(const float* rows) const {  // 0 for a pixel without one
+    if (!own_) return load_vectors(rows, first_, lanes_);
+    if (end_ - begin_ == kLanes) return load_vectors(rows, begin_, kLanes);
+    float each[3 * kLanes] = {};
+    for (int64_t ray = begin_; ray < end_; ++ray) copy(each + 3 * (own_[ray] - first_), rows + 3 * ray);
+    Vector a;
+    load_rows<3>(each, a.v);
+    return a;
+  }
+
+ private:
+  static void copy(float* to, const float* from) {
+    for (int k = 0; k < 3; ++k) to[k] = from[k];
+  }
+
+  const int64_t* own_;
+  const int64_t first_;
+  const int lanes_;
+  const int64_t begin_;
+  int64_t end_;
+};
+
+// The first ray of `pixel` or of a later one.
+inline int64_t ray_from(const MirrorPixels& in, int64_t pixel) {
+  int64_t low = 0, high = in.own ? in.rays : 0;
+  while (low < high) {
+    const int64_t middle = (low + high) / 2;
+    if (in.own[middle] < pixel) low = middle + 1;
+    else high = middle;
+  }
+  return low;
+}
+
+// work(first, lanes, sent) for every kLanes pixels.
+template <class Work>
+inline void each_group(const MirrorPixels& in, const Work& work) {
+  in_shares(in.threads, (in.count + kLanes - 1) / kLanes, [&](int64_t begin, int64_t end) {
+    int64_t ray = ray_from(in, begin * kLanes);
+    for (int64_t first = begin * kLanes; first < end * kLanes; first += kLanes) {
+      const int lanes = lanes_at(first, in.count);
+      const SentRays sent(in, first, lanes, ray);
+      work(first, lanes, sent);
+      ray = sent.end();
+    }
+  });
+}
+
 }  // namespace
 
 void mirror_rays(const MirrorPixels& in, const MirrorRays& out) {
-  each_block(in.threads, in.count, kLanes, [&](int64_t first) {
-    const int lanes = lanes_at(first, in.count);
+  each_group(in, [&](int64_t first, int lanes, const SentRays& sent) {
     const Surface s(in, first, lanes);
     const vfloat depth = load_first(in.depth + first, lanes);
     Vector origin, direction;
@@ -41,18 +103,17 @@ void mirror_rays(const MirrorPixels& in, const MirrorRays& out) {
       direction.v[k] = 2.f * s.cosine * s.normal.v[k] - s.outward.v[k];
       if (in.raw) direction.v[k] *= s.length;
     }
-    store_vectors(out.origins, first, lanes, origin);
-    store_vectors(out.directions, first, lanes, direction);
+    sent.put(out.origins, origin);
+    sent.put(out.directions, direction);
     store_first(out.cosine + first, s.cosine, lanes);
   });
 }
 
 void mirror_rays_backward(const MirrorPixels& in, const MirrorRays& upstream, const MirrorPixelGradients& out) {
-  each_block(in.threads, in.count, kLanes, [&](int64_t first) {
-    const int lanes = lanes_at(first, in.count);
+  each_group(in, [&](int64_t first, int lanes, const SentRays& sent) {
     const Surface s(in, first, lanes);
-    const Vector to_origin = load_vectors(upstream.origins, first, lanes);
-    Vector to_direction = load_vectors(upstream.directions, first, lanes), to_normal;
+    const Vector to_origin = sent.get(upstream.origins);
+    Vector to_direction = sent.get(upstream.directions), to_normal;
     if (in.raw)
       for (int k = 0; k < 3; ++k) to_direction.v[k] *= s.length;
     const vfloat to_cosine = 2.f * dot(to_direction, s.normal) + load_first(upstream.cosine + first, lanes);

@@ -11,9 +11,11 @@ struct MirrorPixels {
   float shortest_normal;
   bool raw;                            // mirror rays as long as the camera's, else of unit length
   int threads;
+  int64_t rays;        // R
+  const int64_t* own;  // (R) ascending: the pixels whose ray is sent; null: all of them are, and R is P
 };
 struct MirrorRays {  // or the upstream gradients of these
-  float *origins, *directions, *cosine;  // (P, 3), (P, 3), (P)
+  float *origins, *directions, *cosine;  // (R, 3), (R, 3), (P)
 };
 struct MirrorPixelGradients {
   float *normal, *depth;  // (3, P), (P)
