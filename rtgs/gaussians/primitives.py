@@ -61,11 +61,11 @@ class Gaussians:
         Raises:
             KeyError: there is none of this name.
         """
-        found = self.raw.get(name)
-        if found is not None:
-            return found
-        self._check_name(name)
-        return getattr(self, name)
+        if name in PARAMETERS:
+            return getattr(self, name)
+        if name not in self.raw:
+            self._check_name(name)
+        return self.raw[name]
 
     def __setitem__(self, name: str, tensor: Tensor) -> None:
         """Another tensor for a parameter or a channel that is there; whoever changes N sets all of them.

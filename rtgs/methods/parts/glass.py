@@ -222,25 +222,20 @@ class Glass(Part):
         scatters = [None] if self.wall is None else self.wall.scatters(frame.step if frame.training else None)
         outline = None if self.wall is None else self.wall.outline(frame.camera, chosen.index, glass)
         shown = GlassView(frame, chosen, glass, straight, outline, bend)
-        samples = [self._sample(shown, each) for each in scatters]
+        aside = None if outline is None else rays.rows(chosen.index[outline.rows[outline.partly]])
+        samples = [self._sample(shown, each, None if number else aside) for number, each in enumerate(scatters)]
         (met, passed, _), lights = samples[0], mean_of_lights([lights for _, _, lights in samples])
-        if outline is not None:
-            aside = rays.rows(chosen.index[outline.rows[outline.partly]])
-            beside = self._straight(frame).beside(rays.center, aside, self.base.sh_degree(frame.step))
-            lights = with_beside(lights, met.pixels.specular, outline, beside)
-        traced = Traced(
-            glass.flat,
-            chosen,
-            met.pixels,
-            lights,
-            {"transparent": glass.inside.reshape(shape), "specular": flat.specular.reshape(shape)},
-            passed.first_bounce,
-            (*met.observations, *passed.observations),
-        )
+        if outline is not None and passed.beside is not None:
+            lights = with_beside(lights, met.pixels.specular, outline, passed.beside)
+        maps = {"transparent": glass.inside.reshape(shape), "specular": flat.specular.reshape(shape)}
+        seen = (*met.observations, *passed.observations)
+        traced = Traced(glass.flat, chosen, met.pixels, lights, maps, passed.first_bounce, seen)
         return lit_view(frame, raster, traced, self.settings.optics)
 
-    def _sample(self, shown: GlassView, scatter: Scatter | None) -> tuple[Reflected, Transmission, tuple[Light, ...]]:
-        """What one ray of each kind meets behind each traced pixel, and the lights of it; ``scatter``: rough walls."""
+    def _sample(
+        self, shown: GlassView, scatter: Scatter | None, aside: Tensor | None
+    ) -> tuple[Reflected, Transmission, tuple[Light, ...]]:
+        """What one ray of each kind meets behind each traced pixel, and the lights; ``aside`` as ``transmit`` has it."""
         frame, chosen, rays = shown.frame, shown.chosen, shown.rays
         pixels = chosen.index[rays.rows]
         inner = None if self.wall is None else self.wall.inner_rays(frame.camera, rays, pixels)
@@ -253,7 +248,7 @@ class Glass(Part):
         reflection, transmission = self.weights(met, inside, frame.camera, chosen.index, shown.outline)
         near, onward = (rays, None) if bent is None else (bent.near, bent.far)
         wall = None if self.wall is None else FarWall(inner, met.others, self.wall.index, self.wall.tint)
-        passed = self._straight(frame).transmit(frame, near, pixels, wall, onward)
+        passed = self._straight(frame).transmit(frame, near, pixels, wall, onward, aside)
         through = Light("transmission", "transmitted_color", transmission, passed.color, passed.parts)
         own, *coats = self.mirror.lights(met, reflection, inside)
         return met, passed, (own, through, *coats)
@@ -284,9 +279,9 @@ class Glass(Part):
     ) -> tuple[Tensor, Tensor]:
         """w_r and w_t of the traced ``pixels`` (P,), with the S_max and the bound of the object's; ``inside`` (P,)
         bool."""
-        settings, optics = self.settings.transmittance, self.settings.optics
+        settings, optics, cosine = self.settings.transmittance, self.settings.optics, met.cosine
         bounded = settings.max_weight > 0 and settings.interface.count > 0
-        cosine, reflection = met.cosine, reflected_weight(met.cosine, met.pixels, optics)
+        reflection = reflected_weight(cosine, met.pixels, optics)
         if self.wall is not None:
             rows = inside.nonzero()[:, 0]
             return self.wall.weights(reflection, cosine, rows, self.wall.walls(camera, pixels[rows]), outline)

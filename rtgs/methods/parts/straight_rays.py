@@ -81,18 +81,24 @@ class StraightRays:
         pixels: Tensor,
         wall: FarWall | None = None,
         onward: GlassRays | None = None,
+        aside: Tensor | None = None,
     ) -> Transmission:
         """C_t of the traced pixels: what the first bounce meets, and behind the object the second.
 
         ``pixels`` (R,) int64: flattened, of the rays. ``wall``: the object's far wall reflects light as well; None: it
-        lets all pass. ``onward``: the same rays behind it, if they are bent there.
+        lets all pass. ``onward``: the same rays behind it, if they are bent there. ``aside`` (B, 3): directions of more
+        rays from the camera, which show what the base set is as if the object were not there.
         """
         degree = self.base.sh_degree(frame.step)
         first, observations = self._first_bounce(frame, rays, pixels, degree)
         assert first.colors is not None
-        color, parts = first.colors, {}
+        color, parts, beside = first.colors, {}, None
+        if aside is not None and not (self._goes_on and self.settings.transmittance.second_bounce_gradient):
+            aside, beside = None, self._beside(frame.rays.center, aside, degree)
         if self._goes_on:
-            rows, behind = self._behind(rays if onward is None else onward, first, degree)
+            more = None if aside is None else (frame.rays.center, aside)
+            rows, behind, met_aside = self._behind(rays if onward is None else onward, first, degree, more)
+            beside = beside if aside is None else met_aside
             behind = self._uncut(behind) if self.uncut else behind
             over = self.settings.transmittance.compositing == "over"
             if wall is None:
@@ -103,7 +109,7 @@ class StraightRays:
                 parts = _parts(first.colors, color, met) if frame.options.layers else {}
         full, *lights = (_of_pixels(rays, each) for each in (color, *parts.values()))
         depths = self._depths(rays, first) if self.measured else None
-        return Transmission(full, depths, observations, dict(zip(parts, lights, strict=True)))
+        return Transmission(full, depths, observations, dict(zip(parts, lights, strict=True)), beside)
 
     @property
     def _goes_on(self) -> bool:
@@ -133,8 +139,7 @@ class StraightRays:
         origins, directions, lengths = (
             torch.cat([getattr(leg, name) for leg in legs]) for name in ("origin", "direction", "length")
         )
-        start = self.settings.transmittance.offset * self.base.extent
-        options = self._options(start, lengths.clamp_min(2 * start), self.own_degree, False)
+        options = self._options(self._start, lengths.clamp_min(2 * self._start), self.own_degree, False)
         inside, _ = self.own.trace(origins, directions, options, watched=False)
         assert inside.colors is not None
         values = (wall.inner.by_leg(each) for each in (inside.colors, inside.alpha, wall.surroundings))
@@ -172,7 +177,7 @@ class StraightRays:
         thickness = rays.far - rays.near
         origins, directions = rays.at(rays.near)
         depth = self.measured or settings.second_bounce == "first_bounce"
-        start = settings.offset * self.base.extent
+        start = self._start
         if self.own is None:
             return self._trace_base(origins, directions, self._options(start, thickness, degree, depth)), ()
         clip = settings.first_bounce_end == "clip"
@@ -180,8 +185,12 @@ class StraightRays:
         options = replace(self._options(start, bound, self.own_degree, depth), weight_sum=self.watched)
         return self.own.trace(origins, directions, options, watched=self.watched)
 
-    def _behind(self, rays: GlassRays, first: TraceBuffers, degree: int) -> tuple[Tensor, Tensor]:
-        """(K,) the rays that go on behind the object, and (K, 3) what the base set shows them there."""
+    def _behind(
+        self, rays: GlassRays, first: TraceBuffers, degree: int, aside: tuple[Tensor, Tensor] | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """(K,) the rays that go on behind the object, (K, 3) what the base set shows them there, and (B, 3) what it
+        shows the rays ``aside``: their origin (3,) and directions (B, 3). One trace: each has a gradient by the whole
+        set."""
         settings = self.settings.transmittance
         left = 1 - first.alpha.detach()
         every = settings.compositing != "over"
@@ -192,17 +201,26 @@ class StraightRays:
             back = rays.near + first.depth.detach()
         origins, directions = rays.at(back[rows], rows)
         start = settings.second_offset * self.mesh.voxel / directions.norm(dim=1)
+        if aside is not None:
+            center, more = aside
+            origins, directions = torch.cat((origins, center.expand_as(more))), torch.cat((directions, more))
+            start = torch.cat((start, start.new_full((len(more),), self._start)))
         options = self._options(start, torch.inf, degree, False)
         with torch.set_grad_enabled(torch.is_grad_enabled() and settings.second_bounce_gradient):
             second = self._trace_base(origins, directions, options).colors
         assert second is not None
-        return rows, second
+        behind, beside = second.split((len(rows), len(second) - len(rows)))
+        return rows, behind, beside
 
-    def beside(self, center: Tensor, directions: Tensor, degree: int) -> Tensor:
+    @property
+    def _start(self) -> float:
+        """World units from where a ray begins to the first hit that counts."""
+        return self.settings.transmittance.offset * self.base.extent
+
+    def _beside(self, center: Tensor, directions: Tensor, degree: int) -> Tensor:
         """(B, 3) encoded colours that the base set, its SH up to ``degree``, shows along rays (B, 3) from the camera's
         ``center``, as if the object were not there."""
-        start = self.settings.transmittance.offset * self.base.extent
-        options = self._options(start, torch.inf, degree, False)
+        options = self._options(self._start, torch.inf, degree, False)
         found = self._trace_base(center.expand_as(directions).contiguous(), directions, options).colors
         assert found is not None
         return found
@@ -215,8 +233,7 @@ class StraightRays:
         depth, alpha, beyond = first.depth[rows], first.alpha[rows], None
         if self.settings.loss.transmission_depth_form == "per_hit":
             assert self.own is not None
-            start = self.settings.transmittance.offset * self.base.extent
-            options = self._options(start, thickness, self.own_degree, True)
+            options = self._options(self._start, thickness, self.own_degree, True)
             near, _ = self.own.trace(*rays.at(rays.near[rows], rows), options, watched=False)
             assert near.depth is not None
             beyond = depth - near.depth - thickness * (alpha - near.alpha)

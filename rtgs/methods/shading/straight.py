@@ -66,6 +66,7 @@ class Transmission:
     first_bounce: FirstBounce | None  # in training, for rays with a second surface
     observations: tuple[Observation, ...] = ()  # in training, of the transmittance set
     parts: Mapping[str, Tensor] = field(default_factory=dict)  # (3, P) linear light each, when layers are asked for
+    beside: Tensor | None = None  # (B, 3) encoded, what rays that pass the object meet; None: there are none
 
 
 def glass_pixels(
