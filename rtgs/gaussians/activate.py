@@ -61,7 +61,8 @@ def activate_geometry(gaussians: Gaussians) -> ActivatedGaussians:
     For the tracer, which evaluates colours itself, at the direction of each ray.
     """
     raw = [gaussians[name] for name in PARAMETERS]
-    raw[4], raw[5] = raw[4].detach(), raw[5].new_empty(len(raw[5]), 0, 3)
+    raw[0], raw[4] = raw[0].detach(), raw[4].detach()  # colours alone would give them a gradient
+    raw[5] = raw[5].new_empty(len(raw[5]), 0, 3)
     return ActivatedGaussians(gaussians.means, *_Activate.apply(None, (0.0, 0.0, 0.0), 0, *raw))
 
 

@@ -255,9 +255,10 @@ def _joined(base: Rows, appended: Sequence[Rows]) -> tuple[ActivatedGaussians, T
     if not appended:
         return base.shape, base.features
     every = (base, *appended)
-    names = [field.name for field in fields(ActivatedGaussians)]
-    shape = ActivatedGaussians(**{name: torch.cat([getattr(rows.shape, name) for rows in every]) for name in names})
-    return shape, torch.cat([rows.features for rows in every])
+    features = torch.cat([rows.features for rows in every])
+    names = [field.name for field in fields(ActivatedGaussians) if field.name != "colors"]
+    joined = {name: torch.cat([getattr(rows.shape, name) for rows in every]) for name in names}
+    return ActivatedGaussians(**joined, colors=features[:, :3]), features
 
 
 def _decide_density(mcmc: McmcSettings | None, schedule: ScheduleSettings) -> tuple[Decision, ...]:

@@ -235,7 +235,8 @@ class Glass(Part):
     def _sample(
         self, shown: GlassView, scatter: Scatter | None, aside: Tensor | None
     ) -> tuple[Reflected, Transmission, tuple[Light, ...]]:
-        """What one ray of each kind meets behind each traced pixel, and the lights; ``aside`` as ``transmit`` has it."""
+        """What one ray of each kind meets behind each traced pixel, and the lights of it; ``scatter``: rough walls;
+        ``aside``: directions of rays beside the object, as :meth:`StraightRays.transmit` has them."""
         frame, chosen, rays = shown.frame, shown.chosen, shown.rays
         pixels = chosen.index[rays.rows]
         inner = None if self.wall is None else self.wall.inner_rays(frame.camera, rays, pixels)
