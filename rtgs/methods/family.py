@@ -51,7 +51,7 @@ TRANSMITTANCE = StageSpec(
     on=_transmittance_on,
     on_key="method.transmittance.enabled",
     needs_object=True,
-    version=8,
+    version=9,
 )
 """Straight rays through the transparent object, all sets jointly."""
 
