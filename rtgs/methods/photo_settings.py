@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from rtgs.core.recipe import UNLESS_DEFAULT
-from rtgs.core.refuse import refuse_bad_counts, refuse_bad_numbers, refuse_below, refuse_unless
+from rtgs.core.refuse import refuse_bad_counts, refuse_bad_numbers, refuse_unless
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,6 @@ class AppearanceSettings:
             value = getattr(self, name)
             refuse_unless(value > 0, f"method.appearance.{name}", value, "above 0 (enabled=false learns nothing)")
         refuse_bad_counts(self, "method.appearance", warm_up=0)
-        refuse_below("method.appearance.learn_above", self.learn_above, 0)
 
 
 @dataclass(frozen=True)

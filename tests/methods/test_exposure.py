@@ -19,7 +19,6 @@ from rtgs.gaussians.ply import write_ply
 from rtgs.methods import Mode, create_method
 from rtgs.methods.parts.exposure import Exposure, as_photographed, exposed, nearest_photos, rows_by_name
 from rtgs.methods.photo_settings import AppearanceSettings
-from rtgs.render.pose import moved
 from rtgs.scenes.scene import Scene, View
 from rtgs.train.checkpoint import checkpoint_path
 from rtgs.train.guard import TrainingDiverged
@@ -131,15 +130,51 @@ def test_neighbours_are_believed_as_far_as_training_photos_agree_with_theirs():
 
 
 def test_nearest_photos_are_weighted_by_distance_and_turn():
+    """Of places on a line and turns to the right the nearest two, by hand."""
     scene = photographed("2dgs", views=5)
     first = scene.train[0].camera
-    near = moved(first, torch.tensor([0.0, 0.0, 0.0, *[0.0] * 6]), scene.extent).of(first)
-    rows, weights = nearest_photos(near, scene)
-    assert int(rows[0]) == 0
-    assert float(weights[0]) > 0.999
-    rows, weights = nearest_photos(first, scene)  # of a training view: others
+    numbers = [(0.0, 0.0), (0.3, 0.1), (0.1, 0.4), (0.9, 0.0)]  # shares of the extent, radians
+
+    def put(far: float, turn: float) -> Camera:
+        cosine, sine = math.cos(turn), math.sin(turn)
+        turned = torch.tensor([[cosine, 0.0, -sine], [0.0, 1.0, 0.0], [sine, 0.0, cosine]]).double() @ first.rotation
+        center = first.center + far * scene.extent * torch.tensor([0.0, 1.0, 0.0]).double()
+        return replace(first, rotation=turned, translation=-turned @ center)
+
+    views = (replace(view, camera=put(*each)) for view, each in zip(scene.train, numbers, strict=True))
+    rows, weights = nearest_photos(put(0.1, 0.1), replace(scene, train=tuple(views)))
+    assert rows.tolist() == [0, 1]
+    squares = torch.tensor([0.1**2 + 0.1**2, 0.2**2])
+    expected = 1 / (squares + 1e-4)
+    torch.testing.assert_close(weights, expected / expected.sum(), atol=1e-4, rtol=0)
+
+
+def test_the_photo_itself_does_not_tell_a_training_view():
+    scene = photographed("2dgs", views=5)
+    rows, weights = nearest_photos(scene.train[0].camera, scene)
     assert 0 not in rows.tolist()
     assert float(weights.sum()) == pytest.approx(1)
+
+
+def test_a_view_held_out_for_a_judge_is_told_as_a_test_view_is():
+    scene = photographed("2dgs", views=7)
+    *kept, last = scene.train
+    scene = replace(scene, train=tuple(kept), held=(last,))
+    method = create_method(replace(plain("2dgs"), appearance=FAST), scene, steady(20), generator_for(0, "initialise"))
+    part = method.parts["exposure"]
+    assert isinstance(part, Exposure)
+    with torch.no_grad():
+        part.group["stops"].fill_(0.25)  # as brightly as its neighbours
+        shown, bare = (
+            method.render(camera, 20, Mode.EVALUATE).image
+            for camera in (last.camera, replace(last.camera, name="nobody"))
+        )
+    torch.testing.assert_close(shown, 2**0.25 * bare)
+
+
+def test_a_border_below_zero_is_refused():
+    with pytest.raises(RtgsError, match=r"method\.appearance\.learn_above"):
+        AppearanceSettings(learn_above=-0.1)
 
 
 @pytest.mark.parametrize("spread", [0.0, 0.3])

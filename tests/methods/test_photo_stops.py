@@ -26,6 +26,16 @@ def test_known_stops_are_found():
     assert exposure_spread(grey_photos(STOPS)) == pytest.approx(0.1, abs=1e-5)  # half of the seven are .1 or more off
 
 
+def test_stops_are_those_over_the_median_photo():
+    stops = found(grey_photos([0.3, 0.3, 0.0, 0.3, 0.0]))
+    torch.testing.assert_close(stops, torch.tensor([0.0, 0.0, -0.3, 0.0, -0.3]), atol=1e-5, rtol=0)
+
+
+def test_the_median_photo_is_at_none_where_points_disagree():
+    """Half of the points of a patterned ball are behind it in each photo."""
+    assert float(found(small_scene(8)).median()) == 0
+
+
 def test_photos_alike_have_no_spread():
     assert exposure_spread(grey_photos([0.0] * 6)) == pytest.approx(0, abs=1e-6)
 
@@ -82,6 +92,8 @@ def test_without_points_that_photos_share_nothing_is_told():
     few = LEAST_POINTS - 1
     assert photo_stops(replace(scene, points=scene.points[:few], point_colors=scene.point_colors[:few])) is None
     assert exposure_spread(replace(scene, random_points=True)) is None
+    assert photo_stops(replace(scene, train=scene.train[:1])) is None
+    assert photo_stops(replace(scene, train=())) is None
 
 
 def test_of_many_points_some_are_looked_at():
