@@ -10,6 +10,7 @@ from rtgs.core.recipe import UNLESS_DEFAULT
 from rtgs.core.refuse import refuse_bad_counts, refuse_bad_numbers, refuse_outside, refuse_unknown_words, refuse_unless
 
 DensityStrategy = Literal["adaptive", "mcmc"]
+DensitySignal = Literal["net", "absolute"]
 Orientation = Literal["published", "pca"]
 RoughnessCurve = Literal["log", "linear"]
 
@@ -127,6 +128,9 @@ class DensitySettings:
 
     strategy: DensityStrategy = "adaptive"  # "mcmc": N grows to the cap and stays; no signal, no opacity resets
     gradient_threshold: float = 2e-4  # mean norm of the densification signal (NDC)
+    # What the pixels of a view add up to, for the base set. "net": their gradients, which cancel where one Gaussian
+    # stands for much that differs (3DGS, 2DGS); "absolute": these without their signs (AbsGS, Ye et al. 2024).
+    signal: DensitySignal = field(default="net", metadata=UNLESS_DEFAULT)
     size_border: float = 0.01  # times extent: larger surfels split, smaller ones clone
     split_count: int = 2
     split_shrink: float = 1.6  # scales of the children are divided by it
@@ -167,6 +171,10 @@ class DensitySettings:
             share = getattr(self, name)
             if share is not None:
                 refuse_unless(0 < share < math.inf, f"density.{name}", share, "above 0 and finite, or null")
+
+    def refuse_absolute(self, key: str) -> None:
+        """Raises :class:`rtgs.core.errors.RtgsError` where a set that has no absolute signal is asked for it."""
+        refuse_unless(self.signal == "net", f"{key}.signal", self.signal, "net: the base set alone has the other")
 
 
 @dataclass(frozen=True)

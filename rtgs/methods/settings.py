@@ -134,6 +134,7 @@ class ReflectionSettings:
     def __post_init__(self) -> None:
         refuse_bad_numbers(self, "method.reflection")
         self.init.refuse_shell("method.reflection.init")
+        self.density.refuse_absolute("method.reflection.density")
         refuse_outside(self, "method.reflection", 0, 1, "smallest_alpha", "transmittance_cutoff", "alpha_cutoff")
         refuse_unknown_words(self, "method.reflection")
         for name in ("start", "start_before_glass", "densify_until"):
@@ -294,6 +295,7 @@ class TransmittanceSettings:
     def __post_init__(self) -> None:
         refuse_bad_numbers(self, "method.transmittance")
         self.init.refuse_shell("method.transmittance.init")
+        self.density.refuse_absolute("method.transmittance.density")
         refuse_unknown_words(self, "method.transmittance")
         refuse_bad_counts(self, "method.transmittance", **dict.fromkeys(_EVERY, 1))
         refuse_outside(self, "method.transmittance", 0, 3, "sh_degree")

@@ -24,6 +24,7 @@ class RasterOptions:
     normal: bool = False
     distortion: bool = False
     weight_sum: bool = False
+    absolute_probe: bool = False  # the probe's gradient: sums over the pixels of absolute values (AbsGS)
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,7 @@ class EllipsoidOptions:
     radius_sigmas: float = math.inf  # what lies further out is skipped; 3 is near 3DGS's tile bound, inf is exact
     depth: bool = False
     weight_sum: bool = False
+    absolute_probe: bool = False  # the probe's gradient: sums over the pixels of absolute values (AbsGS)
 
 
 @dataclass(frozen=True)

@@ -106,7 +106,8 @@ class _Call:
     def start(self) -> core.EllipsoidRasterization:
         o = self.options
         camera = native_camera(self.camera, o.near, math.inf)
-        return core.EllipsoidRasterization(camera, o.dilation, o.radius_sigmas, o.antialiased, o.depth)
+        shape = (o.dilation, o.radius_sigmas, o.antialiased)
+        return core.EllipsoidRasterization(camera, *shape, o.depth, o.absolute_probe)
 
 
 class _Rasterize(torch.autograd.Function):

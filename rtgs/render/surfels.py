@@ -117,7 +117,7 @@ class _Rasterize(torch.autograd.Function):
         needs_depth = options.depth or options.median_depth or options.distortion
         cutoffs = (options.alpha_cutoff, options.transmittance_cutoff)
         camera = native_camera(call.camera, options.near, options.far, cutoffs, options.low_pass)
-        native = core.Rasterization(camera, options.normal, needs_depth)
+        native = core.Rasterization(camera, options.normal, needs_depth, options.absolute_probe)
         native.project(*arrays, call.threads)
 
         image = torch.empty(features.shape[1], height, width, dtype=torch.float32)

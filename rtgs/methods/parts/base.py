@@ -162,6 +162,7 @@ class BaseSet(Part):
             torch.nn.functional.pad(self._background, (0, features.shape[1] - 3)),
             self.settings.render,
             self.extent,
+            self.set.density.settings.signal == "absolute",
             self._normal_residual(more) if wanted.normal else None,
             self._bent(frame, rows, more) if wanted.normal else None,
         )

@@ -33,6 +33,7 @@ class RasterRequest:
     background: Tensor  # (C,) of the features
     settings: RenderSettings
     extent: float  # of the scene, world units: near and far are shares of it
+    absolute_probe: bool = False  # its gradient sums absolute values over the pixels
     normal_residual: Tensor | None = None  # (N, 3) of the normals of ellipsoids, where the set has one
     normals: Tensor | None = None  # (N, 3) world, of ellipsoids: composited instead of those of the shortest axes
 
@@ -84,7 +85,10 @@ def _surfels(rows: ActivatedGaussians, features: Tensor, request: RasterRequest)
         features,
         request.camera,
         background=request.background,
-        options=surfel_options(request.wanted, request.settings, request.extent, weight_sum=request.weight_sum),
+        options=replace(
+            surfel_options(request.wanted, request.settings, request.extent, weight_sum=request.weight_sum),
+            absolute_probe=request.absolute_probe,
+        ),
         screen_probe=request.probe,
     )
 
@@ -126,6 +130,7 @@ def _composited(rows: ActivatedGaussians, features: Tensor, request: RasterReque
             antialiased=settings.antialiased,
             depth=request.wanted.depth,
             weight_sum=request.weight_sum,
+            absolute_probe=request.absolute_probe,
         ),
         screen_probe=request.probe,
     )

@@ -8,8 +8,9 @@ namespace {
 
 class EllipsoidRasterization : public RasterSession {
  public:
-  EllipsoidRasterization(const CameraValues& camera, double dilation, double radius_sigmas, bool antialiased, bool depth)
-      : RasterSession(camera.values), depth_(depth) {
+  EllipsoidRasterization(const CameraValues& camera, double dilation, double radius_sigmas, bool antialiased, bool depth,
+                         bool absolute)
+      : RasterSession(camera.values), depth_(depth), absolute_(absolute) {
     const double radius = radius_sigmas < 1e3 ? radius_sigmas : 1e3;  // the alpha cut bites long before
     settings_ = {float(dilation), float(radius * radius), antialiased};
   }
@@ -59,8 +60,9 @@ class EllipsoidRasterization : public RasterSession {
     layout.channels = features + (depth_ ? 1 : 0);
     layout.padded_channels = RTGS_CALL(isa_, padded_channels, layout.channels);
     layout.depth = depth_;
+    layout.absolute = absolute_;
     layout.record_stride = whole_lines(EllipsoidRecord::kChannels + layout.padded_channels);
-    layout.gradient_sums = EllipsoidSums::kChannels + layout.padded_channels;
+    layout.gradient_sums = EllipsoidSums::kChannels + layout.padded_channels + (absolute_ ? 2 : 0);
     layout.gradient_stride = whole_lines(layout.gradient_sums);
     return layout;
   }
@@ -72,7 +74,7 @@ class EllipsoidRasterization : public RasterSession {
   }
 
   EllipsoidSettings settings_;
-  bool depth_;
+  bool depth_, absolute_;
 };
 
 }  // namespace
@@ -80,8 +82,8 @@ class EllipsoidRasterization : public RasterSession {
 void bind_ellipsoids(nb::module_& m) {
   nb::class_<EllipsoidRasterization>(m, "EllipsoidRasterization",
                                      "One ellipsoid rasterisation; see rtgs/render/ellipsoids.py.")
-      .def(nb::init<const CameraValues&, double, double, bool, bool>(), nb::arg("camera"), nb::arg("dilation"),
-           nb::arg("radius_sigmas"), nb::arg("antialiased"), nb::arg("depth"))
+      .def(nb::init<const CameraValues&, double, double, bool, bool, bool>(), nb::arg("camera"), nb::arg("dilation"),
+           nb::arg("radius_sigmas"), nb::arg("antialiased"), nb::arg("depth"), nb::arg("absolute") = false)
       .def("project", &EllipsoidRasterization::project)
       .def("forward", &EllipsoidRasterization::forward, nb::arg("background").none(), nb::arg("feature_image"),
            nb::arg("alpha"), nb::arg("depth").none(), nb::arg("weight_sum").none())

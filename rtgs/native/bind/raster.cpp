@@ -8,8 +8,8 @@ namespace {
 
 class Rasterization : public RasterSession {
  public:
-  Rasterization(const CameraValues& camera, bool normal, bool depth)
-      : RasterSession(camera.values), normal_(normal), depth_(depth) {}
+  Rasterization(const CameraValues& camera, bool normal, bool depth, bool absolute)
+      : RasterSession(camera.values), normal_(normal), depth_(depth), absolute_(absolute) {}
 
   // Projection, sorting and binning.
   void project(Floats means, Floats tangent_u, Floats tangent_v, Floats scales, Floats opacities, Floats features,
@@ -63,8 +63,9 @@ class Rasterization : public RasterSession {
     layout.padded_channels = RTGS_CALL(isa_, padded_channels, layout.channels);
     layout.normal = normal_;
     layout.depth = depth_;
+    layout.absolute = absolute_;
     layout.record_stride = whole_lines(kChannels + layout.padded_channels + (depth_ ? kDepthFields : 0));
-    layout.gradient_sums = kGradChannels + layout.padded_channels + (depth_ ? 2 : 0);
+    layout.gradient_sums = kGradChannels + layout.padded_channels + (depth_ ? 2 : 0) + (absolute_ ? 2 : 0);
     layout.gradient_stride = whole_lines(layout.gradient_sums);
     return layout;
   }
@@ -82,7 +83,7 @@ class Rasterization : public RasterSession {
     return args;
   }
 
-  bool normal_, depth_;
+  bool normal_, depth_, absolute_;
 };
 
 }  // namespace
@@ -95,7 +96,8 @@ void bind_raster(nb::module_& m) {
            nb::arg("width"), nb::arg("height"), nb::arg("near"), nb::arg("far"), nb::arg("min_alpha") = 1.0 / 255,
            nb::arg("min_transmittance") = 1e-4, nb::arg("low_pass") = 0.5);
   nb::class_<Rasterization>(m, "Rasterization", "One surfel rasterisation; see rtgs/render/surfels.py.")
-      .def(nb::init<const CameraValues&, bool, bool>(), nb::arg("camera"), nb::arg("normal"), nb::arg("depth"))
+      .def(nb::init<const CameraValues&, bool, bool, bool>(), nb::arg("camera"), nb::arg("normal"), nb::arg("depth"),
+           nb::arg("absolute") = false)
       .def("project", &Rasterization::project)
       .def("forward", &Rasterization::forward, nb::arg("background").none(), nb::arg("feature_image"),
            nb::arg("normal_image").none(), nb::arg("alpha"), nb::arg("depth").none(), nb::arg("median_depth").none(),

@@ -24,9 +24,10 @@ static inline bool before_range(const ForwardArgs& forward, int64_t id, int firs
   return int64_t(rect.y0) * forward.camera.tiles_x() + rect.x0 < first_tile;
 }
 
-template <class Footprint, int C, bool kExtras>
+template <class Footprint, int C, bool kExtras, bool kAbsolute>
 struct TileBackward {
-  static constexpr int kSums = Footprint::kGradChannels + C + (kExtras ? Footprint::kExtraSums : 0);
+  static constexpr int kExtraSums = (kExtras ? Footprint::kExtraSums : 0) + (kAbsolute ? 2 : 0);
+  static constexpr int kSums = Footprint::kGradChannels + C + kExtraSums;
   static constexpr int kPaddedSums = (kSums + kLanes - 1) / kLanes * kLanes;
   BlockGradients<C> blocks[kBlocks];
   typename Footprint::ExtraUpstream extras[kExtras ? kBlocks : 1];
@@ -35,8 +36,8 @@ struct TileBackward {
   void run(const BackwardArgs& args, const Tile& tile, Range& range);
 };
 
-template <class Footprint, int C, bool kExtras>
-void TileBackward<Footprint, C, kExtras>::load_state(const BackwardArgs& args, const Tile& tile) {
+template <class Footprint, int C, bool kExtras, bool kAbsolute>
+void TileBackward<Footprint, C, kExtras, kAbsolute>::load_state(const BackwardArgs& args, const Tile& tile) {
   const ForwardArgs& forward = args.forward;
   const RasterCamera& camera = forward.camera;
   vmask all_finite = first_lanes(kLanes);
@@ -67,7 +68,7 @@ void TileBackward<Footprint, C, kExtras>::load_state(const BackwardArgs& args, c
 }
 
 // Adds the gradient sums of one Gaussian in one block to `sums`: the footprint's, then those of the channels.
-template <class Footprint, int C, bool kExtras>
+template <class Footprint, int C, bool kExtras, bool kAbsolute>
 static inline __attribute__((always_inline)) void add_block(const typename Footprint::BackwardFlags& flags,
                                                             const typename Footprint::Entry& gaussian, const float* record,
                                                             int entry, int block, vfloat least_transmittance,
@@ -94,12 +95,14 @@ static inline __attribute__((always_inline)) void add_block(const typename Footp
   const vfloat log_alpha = where(shown & lt(raw, broadcast(kMaxAlpha)),
                                  (transmittance * to_weight - rest * reciprocal(1.f - alpha)) * alpha);
   Footprint::template add_gradients<C, kExtras>(record, r, log_alpha, to_extra, sums);
+  constexpr int kAfter = kGradChannels + C + (kExtras ? Footprint::kExtraSums : 0);
+  if constexpr (kAbsolute) Footprint::add_absolute(flags, record, r, log_alpha, sums + kAfter);
 #pragma GCC unroll 36
   for (int k = 0; k < C; ++k) sums[kGradChannels + k] += w * state.channels[k];
 }
 
-template <class Footprint, int C, bool kExtras>
-void TileBackward<Footprint, C, kExtras>::run(const BackwardArgs& args, const Tile& tile, Range& range) {
+template <class Footprint, int C, bool kExtras, bool kAbsolute>
+void TileBackward<Footprint, C, kExtras, kAbsolute>::run(const BackwardArgs& args, const Tile& tile, Range& range) {
   constexpr int kFloats = Footprint::kChannels + C + (kExtras ? Footprint::kExtraFields : 0);
   const ForwardArgs& forward = args.forward;
   const LaneOffsets offsets;
@@ -128,8 +131,8 @@ void TileBackward<Footprint, C, kExtras>::run(const BackwardArgs& args, const Ti
     while (remaining) {
       const int block = __builtin_ctzll(remaining);
       remaining &= remaining - 1;
-      add_block<Footprint, C, kExtras>(flags, gaussian, record, int(entry), block, least_transmittance, blocks[block],
-                                       extras[kExtras ? block : 0], sums);
+      add_block<Footprint, C, kExtras, kAbsolute>(flags, gaussian, record, int(entry), block, least_transmittance,
+                                                  blocks[block], extras[kExtras ? block : 0], sums);
     }
     float* row = args.rows + layout.gradient_stride * id;
     const bool waits = before_range(forward, id, range.first_tile);
@@ -145,12 +148,12 @@ void TileBackward<Footprint, C, kExtras>::run(const BackwardArgs& args, const Ti
   }
 }
 
-template <class Footprint, int C, bool kExtras>
+template <class Footprint, int C, bool kExtras, bool kAbsolute>
 void backward_tiles(const BackwardArgs& args) {
   const int threads = args.forward.threads;
   split_work(args);
   in_parts(threads, [&](int part) {
-    alignas(64) TileBackward<Footprint, C, kExtras> state;
+    alignas(64) TileBackward<Footprint, C, kExtras, kAbsolute> state;
     if (kExtras) memset(static_cast<void*>(state.extras), 0, sizeof state.extras);
     const int begin = int(args.range_starts[part]), end = int(args.range_starts[part + 1]);
     const int64_t first_waiting = args.forward.tiles.starts[begin];
@@ -165,10 +168,16 @@ void backward_tiles(const BackwardArgs& args) {
   });
 }
 
+template <class Footprint, int C, bool kExtras>
+void backward_by_signal(const BackwardArgs& args) {
+  if (args.forward.gaussians.layout.absolute) backward_tiles<Footprint, C, kExtras, true>(args);
+  else backward_tiles<Footprint, C, kExtras, false>(args);
+}
+
 template <class Footprint, int C>
 void backward_of(const BackwardArgs& args) {
-  if (Footprint::has_extras(args)) backward_tiles<Footprint, C, true>(args);
-  else backward_tiles<Footprint, C, false>(args);
+  if (Footprint::has_extras(args)) backward_by_signal<Footprint, C, true>(args);
+  else backward_by_signal<Footprint, C, false>(args);
 }
 
 }  // namespace rtgs::RTGS_ISA

@@ -101,6 +101,14 @@ struct EllipsoidFootprint {
     sums[Sums::kW01] += to_w0 * r.w1;
     sums[Sums::kW11] += to_w1 * r.w1;
   }
+
+  // Adds |dL/dm| times kHalfLog2E, with m the projected centre, to two sums.
+  static inline __attribute__((always_inline)) void add_absolute(const BackwardFlags&, const float* record,
+                                                                 const Response& r, vfloat log_alpha, vfloat* sums) {
+    const vfloat to_w0 = log_alpha * r.w0, to_w1 = log_alpha * r.w1;
+    sums[0] += abs(record[Record::kL0] * to_w0 + record[Record::kL1] * to_w1);
+    sums[1] += abs(record[Record::kL2] * to_w1);
+  }
 };
 
 }  // namespace rtgs::RTGS_ISA

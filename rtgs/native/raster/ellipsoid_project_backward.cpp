@@ -70,8 +70,13 @@ ParameterGradients chain_rule(const RasterCamera& camera, const EllipsoidGeometr
   if (layout.depth) to_p.z = to_p.z + rows.field(Sums::kChannels + features);
   out.mean = rotate_back(camera.rotation, to_p);
   out.opacity = sums[Sums::kLogAlpha] / g.opacity;
-  out.probe[0] = to_mean_x * (0.5f * float(camera.width));
-  out.probe[1] = to_mean_y * (0.5f * float(camera.height));
+  vfloat probe_x = to_mean_x, probe_y = to_mean_y;
+  if (layout.absolute) {
+    probe_x = rows.field(layout.gradient_sums - 2) * (1.f / kHalfLog2E);
+    probe_y = rows.field(layout.gradient_sums - 1) * (1.f / kHalfLog2E);
+  }
+  out.probe[0] = probe_x * (0.5f * float(camera.width));
+  out.probe[1] = probe_y * (0.5f * float(camera.height));
   return out;
 }
 

@@ -13,7 +13,7 @@ struct Forward {
 
 template <int C>
 struct Backward {
-  static void run(const BackwardArgs& args) { backward_tiles<EllipsoidFootprint, C, false>(args); }
+  static void run(const BackwardArgs& args) { backward_by_signal<EllipsoidFootprint, C, false>(args); }
 };
 
 }  // namespace

@@ -42,10 +42,11 @@ struct RecordLayout {
   int channels;         // composited per Gaussian: features and, if asked for, the surfels' normal or the ellipsoids' depth
   int padded_channels;  // the kernel's compile-time count
   int record_stride;    // floats, whole cache lines
-  int gradient_sums;    // floats of a gradient row that are in use
+  int gradient_sums;    // floats of a gradient row that are in use; with `absolute` the last two are of |dL/dm|
   int gradient_stride;  // whole cache lines
   bool normal, depth;   // surfels: normal among the channels, depth fields in record and gradient row; ellipsoids: depth
                         // among the channels
+  bool absolute;        // the probe gets sums over the pixels of |dL/dm|, with m the projected centre, pixels
 };
 
 struct ProjectedGaussians {

@@ -124,9 +124,11 @@ struct SurfelFootprint {
   struct BackwardFlags {
     bool depth, median, distortion;
     float depth_scale;  // m = constant - depth_scale / z, the constant of the forward pass
+    float low_pass;
     explicit BackwardFlags(const BackwardArgs& a)
         : depth(a.grad_depth != nullptr), median(a.grad_median != nullptr), distortion(a.grad_distortion != nullptr),
-          depth_scale(a.forward.camera.far * a.forward.camera.near / (a.forward.camera.far - a.forward.camera.near)) {}
+          depth_scale(a.forward.camera.far * a.forward.camera.near / (a.forward.camera.far - a.forward.camera.near)),
+          low_pass(a.forward.camera.low_pass) {}
   };
   static bool has_extras(const BackwardArgs& a) { return a.forward.gaussians.layout.depth; }
 
@@ -203,6 +205,16 @@ struct SurfelFootprint {
     sums[kGradDy] += to_d * r.dy;
     sums[kGradDiscX] += disc * r.dx;
     sums[kGradDiscY] += disc * r.dy;
+  }
+
+  // Adds |dL/dm|, with m the projected centre, to two sums: of what the surfel weighs, its depth left out.
+  static inline __attribute__((always_inline)) void add_absolute(const BackwardFlags& flags, const float* record,
+                                                                 const Response& r, vfloat log_alpha, vfloat* sums) {
+    const vfloat plane = where(r.plane, log_alpha), disc = flags.low_pass * (log_alpha - plane);
+    const vfloat q = plane * r.inverse;
+    const vfloat to_u = q * r.u, to_v = q * r.v, to_d = q * r.rho;
+    sums[0] += abs(record[kUx] * to_u + record[kVx] * to_v - record[kDx] * to_d + disc * r.dx);
+    sums[1] += abs(record[kUy] * to_u + record[kVy] * to_v - record[kDy] * to_d + disc * r.dy);
   }
 };
 

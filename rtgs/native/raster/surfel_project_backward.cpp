@@ -64,8 +64,14 @@ ParameterGradients chain_rule(const RasterCamera& camera, const SurfelGeometry& 
     out.tangent_v = out.tangent_v + cross(to_normal, g.tangent_u);
   }
   out.opacity = sums[kGradLogAlpha] / g.opacity;
-  out.probe_x = to_p.x * g.p.z * (0.5f * float(camera.width) / camera.fx);
-  out.probe_y = to_p.y * g.p.z * (0.5f * float(camera.height) / camera.fy);
+  const float half_width = 0.5f * float(camera.width), half_height = 0.5f * float(camera.height);
+  if (layout.absolute) {
+    out.probe_x = rows.field(layout.gradient_sums - 2) * half_width;
+    out.probe_y = rows.field(layout.gradient_sums - 1) * half_height;
+  } else {
+    out.probe_x = to_p.x * g.p.z * (half_width / camera.fx);
+    out.probe_y = to_p.y * g.p.z * (half_height / camera.fy);
+  }
   return out;
 }
 

@@ -20,7 +20,9 @@ from rtgs.render.reference.surfels import (
     ALPHA_MAX,
     TRANSMITTANCE_CUT,
     checkpointed,
+    half_size,
     kept_surfels,
+    nowhere_moved,
     pixel_centers,
     pixel_chunks,
     transmittance_before,
@@ -85,12 +87,14 @@ def rasterize_ellipsoids(
     check_shapes(means, tangent_u, tangent_v, scales, opacities, features, background, screen_probe, scale_axes=3)
     local = camera.to_camera(means)
     keep = kept_surfels(local, tangent_u, tangent_v, scales, opacities, features, options.near)
-    ellipsoids = project(local, tangent_u, tangent_v, scales, opacities, features, camera, keep, options, screen_probe)
+    net, absolute = (None, screen_probe) if options.absolute_probe else (screen_probe, None)
+    ellipsoids = project(local, tangent_u, tangent_v, scales, opacities, features, camera, keep, options, net)
+    moved = None if absolute is None else half_size(camera, absolute) * absolute[keep]
 
     columns, weight_sums = [], []
     pixels = pixel_centers(camera, means)
     for chunk in pixel_chunks(pixels, len(keep)):
-        picture, weights = checkpointed(lambda part: composite(ellipsoids, part, options), chunk, len(pixels))
+        picture, weights = checkpointed(lambda part: composite(ellipsoids, part, options, moved), chunk, len(pixels))
         columns.append(picture)
         weight_sums.append(weights)
     picture = torch.cat(columns).T.reshape(-1, camera.height, camera.width)
@@ -170,8 +174,7 @@ def project(
     principal = torch.tensor((camera.cx, camera.cy), dtype=local.dtype)
     center = focal * point[:, :2] / point[:, 2:] + principal
     if screen_probe is not None:
-        half_size = torch.tensor((camera.width / 2, camera.height / 2), dtype=local.dtype)
-        center = center + half_size * (screen_probe - screen_probe.detach())[keep]
+        center = center + half_size(camera, local) * (screen_probe - screen_probe.detach())[keep]
     return ProjectedEllipsoids(
         index=keep, depth=point[:, 2], center=center, factor=factor, opacity=opacity, features=features[keep]
     )
@@ -196,13 +199,18 @@ def decide(ellipsoids: ProjectedEllipsoids, pixels: Tensor, options: EllipsoidOp
     )
 
 
-def composite(ellipsoids: ProjectedEllipsoids, pixels: Tensor, options: EllipsoidOptions) -> tuple[Tensor, Tensor]:
-    """Front-to-back compositing of the pixels (P, 2).
+def composite(
+    ellipsoids: ProjectedEllipsoids, pixels: Tensor, options: EllipsoidOptions, moved: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Front-to-back compositing of the pixels (P, 2); ``moved`` (K, 2): see :func:`nowhere_moved`.
 
     Returns (P, C + 2): features without background, alpha, depth; and the detached sum of weights (K,).
     """
     shown = decide(ellipsoids, pixels, options).contributes
-    offset = torch.where(shown.unsqueeze(-1), pixels[:, None] - ellipsoids.center, 0.0)
+    offset = pixels[:, None] - ellipsoids.center
+    if moved is not None:
+        offset = offset - nowhere_moved(moved, len(pixels))
+    offset = torch.where(shown.unsqueeze(-1), offset, 0.0)
     alpha_raw = ellipsoids.opacity * torch.exp(-0.5 * distance(ellipsoids, offset))
     alpha = torch.where(alpha_raw < ALPHA_MAX, alpha_raw, ALPHA_MAX)  # no gradient where the clamp binds
     alpha = torch.where(shown, alpha, 0.0)

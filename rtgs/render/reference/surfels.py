@@ -96,17 +96,20 @@ def rasterize_surfels(
         seen = (features, camera, background, options, screen_probe)
         return rasterize_convolved(rasterize_surfels, convolve_surfels, surfels, *seen)
     local = camera.to_camera(means)
-    if screen_probe is not None:
+    if screen_probe is not None and not options.absolute_probe:
         local = attach_probe(local, screen_probe, camera)
     keep = kept_surfels(
         local, tangent_u, tangent_v, scales, opacities, features, options.near, opacity_cut=options.alpha_cutoff
     )
     surfels = project(local, means, tangent_u, tangent_v, scales, opacities, features, camera, keep)
+    moved = None
+    if screen_probe is not None and options.absolute_probe:
+        moved = half_size(camera, means) * screen_probe[keep]
     pixels = pixel_centers(camera, means)
 
     columns, weight_sums = [], []
     for chunk in pixel_chunks(pixels, len(keep)):
-        picture, weights = checkpointed(lambda part: composite(surfels, part, options), chunk, len(pixels))
+        picture, weights = checkpointed(lambda part: composite(surfels, part, options, moved), chunk, len(pixels))
         columns.append(picture)
         weight_sums.append(weights)
     picture = torch.cat(columns).T.reshape(-1, camera.height, camera.width)
@@ -138,6 +141,27 @@ def attach_probe(local: Tensor, probe: Tensor, camera: Camera) -> Tensor:
     shift_x = zero[:, 0] * (depth * (camera.width / (2 * camera.fx)))
     shift_y = zero[:, 1] * (depth * (camera.height / (2 * camera.fy)))
     return local + torch.stack((shift_x, shift_y, torch.zeros_like(shift_x)), -1)
+
+
+def half_size(camera: Camera, like: Tensor) -> Tensor:
+    """(2,) pixels for a unit of normalised device coordinates."""
+    return torch.tensor((camera.width / 2, camera.height / 2), dtype=like.dtype)
+
+
+class _NowhereMoved(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, moved: Tensor, pixels: int) -> Tensor:
+        return moved.new_zeros(pixels, *moved.shape)
+
+    @staticmethod
+    def backward(ctx, upstream: Tensor):
+        return upstream.abs().sum(0), None
+
+
+def nowhere_moved(moved: Tensor, pixels: int) -> Tensor:
+    """Zeros (P, K, 2) whose gradients reach ``moved`` (K, 2) as the sum over the pixels of their absolute values."""
+    found: Tensor = _NowhereMoved.apply(moved, pixels)
+    return found
 
 
 @torch.no_grad()
@@ -265,31 +289,44 @@ def decide(surfels: ProjectedSurfels, pixels: Tensor, options: RasterOptions) ->
 
 
 def alpha_and_depth(
-    surfels: ProjectedSurfels, pixels: Tensor, decisions: PixelDecisions, low_pass: float
+    surfels: ProjectedSurfels,
+    pixels: Tensor,
+    decisions: PixelDecisions,
+    low_pass: float,
+    moved: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Differentiable alpha (P, K), 0 where the surfel does not contribute, and depth (P, K) of the contribution."""
+    """Differentiable alpha (P, K), 0 where the surfel does not contribute, and depth (P, K) of the contribution.
+
+    ``moved`` (K, 2): see :func:`nowhere_moved`; depth does not follow it.
+    """
     plane = decisions.contributes & decisions.plane
     disc = decisions.contributes & ~decisions.plane
     offset = pixels[:, None] - surfels.center
     numerator, denominator = ray_plane(surfels, offset)
     safe = torch.where(plane, denominator, 1.0)
+    hit_depth = surfels.depth * surfels.determinant / safe
+    if moved is not None:
+        offset = offset - nowhere_moved(moved, len(pixels))
+        numerator, denominator = ray_plane(surfels, offset)
+        safe = torch.where(plane, denominator, 1.0)
     uv = torch.where(plane.unsqueeze(-1), numerator, 0.0) / safe.unsqueeze(-1)
     disc_offset = torch.where(disc.unsqueeze(-1), offset, 0.0)
     rho = uv.square().sum(-1) + disc_offset.square().sum(-1) / low_pass  # one of the two is zero
     alpha_raw = surfels.opacity * torch.exp(-0.5 * rho)
     alpha = torch.where(alpha_raw < ALPHA_MAX, alpha_raw, ALPHA_MAX)  # no gradient where the clamp binds
-    hit_depth = surfels.depth * surfels.determinant / safe
     return torch.where(decisions.contributes, alpha, 0.0), torch.where(plane, hit_depth, surfels.depth)
 
 
-def composite(surfels: ProjectedSurfels, pixels: Tensor, options: RasterOptions) -> tuple[Tensor, Tensor]:
+def composite(
+    surfels: ProjectedSurfels, pixels: Tensor, options: RasterOptions, moved: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """Front-to-back compositing of the pixels (P, 2).
 
     Returns (P, C + 7): features without background, alpha, depth, median depth, distortion, normal; and the
     detached sum of weights (K,).
     """
     decisions = decide(surfels, pixels, options)
-    alpha, depth = alpha_and_depth(surfels, pixels, decisions, options.low_pass)
+    alpha, depth = alpha_and_depth(surfels, pixels, decisions, options.low_pass, moved)
     transmittance = transmittance_before(alpha)
     weight = alpha * transmittance[:, :-1]
     scalars = torch.stack(
