@@ -125,3 +125,22 @@ def test_only_the_signal_changes_and_never_falls_below_the_net_one(isa: str, opt
     if render is rasterize_ellipsoids:  # of surfels the net signal has the mean's motion through the axes, too
         assert bool((signal >= net_signal.abs() * (1 - 1e-4)).all())
     assert signal.sum() > 1.5 * net_signal.abs().sum()
+
+
+def test_maps_that_nothing_asks_of_do_not_change_it(isa: str):
+    """The signal's place in a row of gradients depends on which maps there are."""
+    scene = ellipsoid_scene(300, 60, 45, 3)
+
+    def signal(*maps: str) -> Tensor:
+        tensors = [t.clone().requires_grad_() for t in scene.tensors]
+        probe = torch.zeros(300, 2, requires_grad=True)
+        options = RasterOptions(absolute_probe=True, **dict.fromkeys(maps, True))  # type: ignore[arg-type]
+        shape = (*tensors[:3], tensors[3][:, :2], *tensors[4:])
+        image = rasterize_surfels(*shape, scene.camera, options=options, screen_probe=probe).features
+        (image * torch.randn(image.shape, generator=torch.Generator().manual_seed(0))).sum().backward()
+        assert probe.grad is not None
+        return probe.grad
+
+    plain = signal()
+    for maps in (("depth",), ("normal",), ("depth", "normal", "distortion")):
+        assert relative_error(signal(*maps), plain).max() < 1e-5, maps
