@@ -65,4 +65,4 @@ def _pairs(inputs: Mapping[str, Path], scene: Scene, regions: Regions) -> Iterat
         yield Pair(numbers, view.image, *images)
 
 
-STEP = StepKind(JUDGE, 4, judge)
+STEP = StepKind(JUDGE, 5, judge)

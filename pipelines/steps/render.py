@@ -271,4 +271,4 @@ def read_timed(folder: Path, times: RenderTimes, view_name: str, camera: Camera 
     )
 
 
-STEP = StepKind("render", 10, render)
+STEP = StepKind("render", 11, render)

@@ -69,6 +69,40 @@ def test_cameras_that_are_off_cost_figures_and_learned_poses_bring_them_back(kin
     assert any("degrees on average" in decision.why for decision in at_learned.decisions)
 
 
+def test_a_test_camera_moves_as_the_nearest_have_and_no_other_camera_does():
+    """By hand: one delta for all goes to the test view as it is; of single ones the nearest four count, the nearest
+    most; a camera that the scene does not know stays."""
+    scene = photographed("3dgs")
+    method = small_trainer(scene, replace(plain("3dgs"), poses=FAST), steady(20)).method
+    poses, view = method.parts["poses"], scene.test[0]
+    deltas = poses.groups[0]["deltas"]
+
+    def aimed(camera: Camera) -> Frame:
+        return poses.aim(Frame(camera, 0, Mode.TRAIN, RenderOptions()))
+
+    with torch.no_grad():
+        deltas.copy_(torch.linspace(-0.03, 0.04, NUMBERS).expand(len(deltas), NUMBERS))
+    told, own = aimed(view.camera), moved(view.camera, deltas[0].detach(), scene.extent).of(view.camera)
+    assert torch.allclose(told.camera.center, own.center, atol=1e-6)
+    assert torch.allclose(told.camera.rotation, own.rotation, atol=1e-6)
+    assert told.pose is None  # it teaches the motions nothing
+    stranger = replace(view.camera, name="elsewhere")
+    assert aimed(stranger).camera is stranger
+
+    steps = []
+    for row in range(len(scene.train)):
+        with torch.no_grad():
+            deltas.zero_()
+            deltas[row, 0] = 0.1
+        steps.append(float((aimed(view.camera).camera.center - view.camera.center).norm()) / scene.extent)
+    away = [float((each.camera.center - view.camera.center).norm()) for each in scene.train]
+    by_distance = [steps[row] for row in sorted(range(len(away)), key=away.__getitem__)]
+    assert sum(by_distance) == pytest.approx(0.1, rel=1e-4)
+    assert min(by_distance[:4]) > 0
+    assert max(by_distance[4:]) == 0
+    assert by_distance[0] > by_distance[3]
+
+
 def test_the_pose_of_a_test_view_is_refined_with_the_gaussians_as_they_are():
     scene = photographed("3dgs")
     trainer, _ = trained(scene, plain("3dgs"), TOTAL)

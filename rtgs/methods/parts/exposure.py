@@ -129,8 +129,8 @@ def exposed(image: Tensor, stops: Tensor, colors: Tensor) -> Tensor:
     return (matrix @ image.flatten(1)).reshape(image.shape)
 
 
-def nearest_photos(camera: Camera, scene: Scene) -> tuple[Tensor, Tensor]:
-    """Rows (K,) of the two training views, other than its own, whose cameras are nearest to ``camera``, and their
+def nearest_photos(camera: Camera, scene: Scene, count: int = NEAREST) -> tuple[Tensor, Tensor]:
+    """Rows (K,) of the ``count`` training views, other than its own, whose cameras are nearest to ``camera``, and their
     weights (K,), which add up to 1: one over the squared distance, of the centre in scene extents and of the axis in
     radians."""
     cameras = [view.camera for view in scene.train]
@@ -138,7 +138,7 @@ def nearest_photos(camera: Camera, scene: Scene) -> tuple[Tensor, Tensor]:
     angles = torch.arccos((axes @ camera.rotation[2]).clamp(-1, 1))
     squares = ((centers - camera.center) / scene.extent).square().sum(1) + angles.square()
     squares[[other is camera for other in cameras]] = torch.inf
-    found, rows = squares.topk(min(NEAREST, len(squares)), largest=False)
+    found, rows = squares.topk(min(count, len(squares)), largest=False)
     weights = 1 / (found + SAME)
     return rows, (weights / weights.sum().clamp_min(1e-30)).float()  # 0: there is no other view
 

@@ -1,4 +1,8 @@
-"""Small motions of the training cameras, learned with the scene (docs/photos.md; gsplat's pose optimisation)."""
+"""Small motions of the training cameras, learned with the scene (docs/photos.md; gsplat's pose optimisation).
+
+The scene and all cameras may drift together. So a test camera moves as the training cameras nearest to it have moved;
+nothing of its own photo is known.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +14,7 @@ import torch
 from torch import Tensor
 
 from rtgs.core.decisions import Decision
-from rtgs.methods.parts.exposure import rows_by_name
+from rtgs.methods.parts.exposure import nearest_photos, rows_by_name, told
 from rtgs.methods.parts.part import Frame, Part
 from rtgs.render.pose import NUMBERS, moved, rotation_of
 from rtgs.train.method import RenderedView
@@ -21,11 +25,12 @@ if TYPE_CHECKING:
     from rtgs.methods.spec import Setup
     from rtgs.scenes.scene import View
 
+NEAREST = 4  # training cameras that a test camera follows
 LIMITS = (-0.3, 0.3)  # of all numbers: beyond it poses are to be searched for anew, and within it rows stay apart
 
 
 class Poses(Part):
-    """A translation and a rotation for each training view; other cameras stay."""
+    """A translation and a rotation for each training view; test views follow the nearest, other cameras stay."""
 
     name = "poses"
 
@@ -34,6 +39,8 @@ class Poses(Part):
         settings = setup.settings.poses
         self.rows = rows_by_name(setup.scene, "method.poses.enabled")
         self.extent = setup.scene.extent
+        unseen = (*setup.scene.test, *setup.scene.held)
+        self.nearest = {view.camera.name: nearest_photos(view.camera, setup.scene, NEAREST) for view in unseen}
         self.decay = settings.decay
         rate = Rate(settings.rate, settings.rate_end, max(setup.schedule.total, 1))
         self.group = ParameterGroup(self.name, {"deltas": torch.zeros(len(self.rows), NUMBERS)}, rate, limits=LIMITS)
@@ -49,16 +56,23 @@ class Poses(Part):
         if bool(deltas.any()):
             shift = self.extent * float(torch.linalg.vector_norm(deltas[:, :3], dim=1).mean())
             found = f", moved by {shift:.3g} world units and {_degrees(deltas):.2g} degrees on average"
-        why = f"method.poses.enabled, {len(self.rows)} cameras{found}; test cameras stay"
+        why = f"method.poses.enabled, {len(self.rows)} cameras{found}; a test camera moves as the {NEAREST} nearest do"
         return (Decision("poses of the training cameras learned", why),)
 
     def aim(self, frame: Frame) -> Frame:
         """From the camera as it is moved by now, with its graph where there is one to be."""
-        row = self.rows.get(frame.camera.name)
-        if row is None:
+        delta = self._of(frame.camera.name)
+        if delta is None:
             return frame
-        pose = moved(frame.camera, self.group["deltas"][row], self.extent)
+        pose = moved(frame.camera, delta, self.extent)
         return replace(frame, camera=pose.of(frame.camera), pose=pose if pose.rotation.requires_grad else None)
+
+    def _of(self, name: str) -> Tensor | None:
+        """(9,) motion of the view of this name; None: it has none, and nothing tells it."""
+        if (row := self.rows.get(name)) is not None:
+            return self.group["deltas"][row]
+        near = self.nearest.get(name)
+        return None if near is None else told(self.group["deltas"].detach(), near)
 
     def terms(self) -> Iterator[LossTerm]:
         """Half the squares, whose gradient is Adam's weight decay."""
