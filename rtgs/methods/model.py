@@ -168,14 +168,15 @@ class Model:
         RenderedView
             The image and its maps.
         """
-        return self.seen(self._aimed(Frame(camera, step, mode, options, mask)))
+        return self.seen(self.aimed(Frame(camera, step, mode, options, mask)))
 
     @torch.no_grad()
     def surface(self, camera: Camera, step: int, options: RenderOptions = NO_OPTIONS) -> RasterBuffers:
         """The buffers of :meth:`render`, without what it makes of them; no gradients."""
-        return self.rasterize(self._aimed(Frame(camera, step, Mode.EVALUATE, options))).buffers
+        return self.rasterize(self.aimed(Frame(camera, step, Mode.EVALUATE, options))).buffers
 
-    def _aimed(self, frame: Frame) -> Frame:
+    def aimed(self, frame: Frame) -> Frame:
+        """As every part has it: with the camera as it is moved by now."""
         for part in self.parts.values():
             frame = part.aim(frame)
         return frame

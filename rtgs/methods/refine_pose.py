@@ -5,6 +5,7 @@ For figures beside those of a test: a pose that is fitted to the photo is no lon
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -26,19 +27,21 @@ RATE = Rate(1e-3, final=1e-5)  # radians, and shares of the scene's extent: at m
 
 
 def refine_pose(model: Model, view: View, step: int, *, steps: int) -> Camera:
-    """The camera of ``view`` moved so that the model, as of ``step``, meets its photo better.
+    """The camera of ``view`` moved so that the model, as of ``step``, meets its photo better when it renders it.
 
-    ``steps`` steps of Adam on the photometric loss; of the poses met on the way the best, which may be the first.
+    It starts where the model sees the view from, which is elsewhere where poses were learned. ``steps`` steps of Adam on
+    the photometric loss; of the poses met on the way the best, which may be the first.
 
     Raises:
         RtgsError: the method traces rays, which give no gradient of the camera.
     """
     rate = Rate(RATE.initial, RATE.final, steps=max(steps, 1))
     group = ParameterGroup("refined", {"delta": torch.zeros(NUMBERS)}, rate, limits=LIMITS)
-    best, least = view.camera, float("inf")
+    seen_from = model.aimed(Frame(view.camera, step, Mode.EVALUATE, RenderOptions(), view.mask)).camera
+    best, least = seen_from, float("inf")
     for index in range(steps + 1):
-        pose = moved(view.camera, group["delta"], model.extent)
-        frame = Frame(pose.of(view.camera), step, Mode.EVALUATE, RenderOptions(), view.mask, pose)
+        pose = moved(seen_from, group["delta"], model.extent)
+        frame = Frame(pose.of(seen_from), step, Mode.EVALUATE, RenderOptions(), view.mask, pose)
         image = model.seen(frame).image
         if model.loss.clipped:
             image = as_the_sensor(image, view.image)
@@ -48,4 +51,11 @@ def refine_pose(model: Model, view: View, step: int, *, steps: int) -> Camera:
         if index < steps:
             (group["delta"].grad,) = torch.autograd.grad(loss, group["delta"])
             group.step(index)
-    return best
+    return best if seen_from is view.camera else _without(best, view.camera, seen_from)
+
+
+def _without(camera: Camera, given: Camera, seen_from: Camera) -> Camera:
+    """The camera that the motion of ``given`` to ``seen_from``, in its own frame, takes to ``camera``."""
+    turn = seen_from.rotation @ given.rotation.T  # x_seen = turn x_given + shift
+    shift = seen_from.translation - turn @ given.translation
+    return replace(camera, rotation=turn.T @ camera.rotation, translation=turn.T @ (camera.translation - shift))

@@ -118,6 +118,31 @@ def test_the_pose_of_a_test_view_is_refined_with_the_gaussians_as_they_are():
     assert all(part.gaussians.means.grad is None for part in trainer.method.sets)  # type: ignore[attr-defined]
 
 
+def test_a_view_that_follows_learned_poses_is_refined_from_where_it_is_seen():
+    """The photo is what the model shows from a little off the view: the refined camera shows it, no step leaves it."""
+    scene = photographed("3dgs")
+    method = small_trainer(scene, replace(plain("3dgs"), poses=FAST), steady(20)).method
+    with torch.no_grad():
+        deltas = method.parts["poses"].groups[0]["deltas"]  # type: ignore[attr-defined]
+        deltas.copy_((0.05 * torch.randn(NUMBERS, generator=torch.Generator().manual_seed(2))).expand_as(deltas))
+
+    def shown(camera: Camera) -> Tensor:
+        with torch.no_grad():
+            return method.render(camera, 0, Mode.EVALUATE).image
+
+    def error(camera: Camera) -> float:
+        return float((shown(camera) - photo.image).square().mean())
+
+    view = scene.test[0]
+    small = 0.01 * torch.randn(NUMBERS, generator=torch.Generator().manual_seed(4))
+    photo = replace(view, image=shown(moved(view.camera, small, scene.extent).of(view.camera)))
+    refined = refine_pose(method, photo, 0, steps=50)  # type: ignore[arg-type]
+    assert error(refined) < 0.2 * error(view.camera)
+    left = refine_pose(method, photo, 0, steps=0)  # type: ignore[arg-type]
+    assert torch.allclose(left.rotation, view.camera.rotation)
+    assert torch.allclose(left.translation, view.camera.translation)
+
+
 def test_no_step_that_helps_leaves_the_pose():
     scene = photographed("2dgs", views=5)
     trainer = small_trainer(scene, plain("2dgs"), steady(10))
