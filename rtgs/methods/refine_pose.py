@@ -29,8 +29,8 @@ RATE = Rate(1e-3, final=1e-5)  # radians, and shares of the scene's extent: at m
 def refine_pose(model: Model, view: View, step: int, *, steps: int) -> Camera:
     """The camera of ``view`` moved so that the model, as of ``step``, meets its photo better when it renders it.
 
-    It starts where the model sees the view from, which is elsewhere where poses were learned. ``steps`` steps of Adam on
-    the photometric loss; of the poses met on the way the best, which may be the first.
+    It starts where the model sees the view from, which is elsewhere where poses were learned. ``steps`` steps of Adam
+    on the photometric loss; of the poses met on the way the best, which may be the first.
 
     Raises:
         RtgsError: the method traces rays, which give no gradient of the camera.
