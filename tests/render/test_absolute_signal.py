@@ -9,7 +9,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from rtgs.core.cameras import Camera
 from rtgs.render.buffers import EllipsoidOptions, RasterOptions
 from rtgs.render.ellipsoids import rasterize_ellipsoids
 from rtgs.render.reference.ellipsoids import rasterize_ellipsoids as ellipsoid_twin
@@ -39,19 +38,6 @@ def alone(axes: int) -> SurfelTensors:
     )
 
 
-def moved_principal_point(camera: Camera, x: float, y: float) -> Camera:
-    return Camera(
-        camera.rotation,
-        camera.translation,
-        camera.fx,
-        camera.fy,
-        camera.cx + x,
-        camera.cy + y,
-        camera.width,
-        camera.height,
-    )
-
-
 @pytest.mark.parametrize(("twin", "axes"), [(ellipsoid_twin, 3), (surfel_twin, 2)])
 def test_it_is_the_sum_over_pixels_of_what_each_changes_by_when_the_picture_moves(twin: Callable, axes: int):
     """A moved principal point moves the whole picture: central differences of each pixel by themselves."""
@@ -61,7 +47,7 @@ def test_it_is_the_sum_over_pixels_of_what_each_changes_by_when_the_picture_move
     upstream = torch.randn(3, 7, 9, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
 
     def pixels(x: float, y: float) -> Tensor:  # (H, W), what each adds to the loss
-        found = twin(*one.all(), moved_principal_point(camera, x, y))
+        found = twin(*one.all(), replace(camera, cx=camera.cx + x, cy=camera.cy + y))
         return (torch.cat((found.features, found.alpha[None])) * upstream).sum(0)
 
     probe = torch.zeros(1, 2, dtype=torch.float64, requires_grad=True)
