@@ -128,7 +128,7 @@ def build_graph(config: RunConfig, choices: Choices, inspections: Inspections | 
     made = (rendered, measured) if mesh is None else (mesh, rendered, measured)
     unread = find_method(config.method.name).unread_losses(config.method)
     late = (*why_judged_late(config, opponent), *why_exposures_unseen(config))
-    moved = (*_moved_starts(config, transparency.present), *late)
+    moved = (*_in_this_scene(config, transparency.present), *late)
     params = _report_params(config, choices, skipped, (*unread, *moved))
     page = report.STEP.step(params, *prepared.steps, scene, *training, *judge_steps, *made)
     return RunGraph(scene, training, rendered, measured, page, mesh, judge_steps, skipped, unread, moved)
@@ -203,14 +203,18 @@ def _through_glass(config: RunConfig, transparent: bool) -> bool:
     return transparent and find_method(config.method.name).object_stage(config.method) is not None
 
 
-def _moved_starts(config: RunConfig, transparent: bool) -> tuple[Decision, ...]:
-    """What begins at another time than in other scenes."""
-    reflection = config.method.reflection
-    start = config.method.in_scene(glass=_through_glass(config, transparent)).reflection.start
-    if start == reflection.start:
-        return ()
-    why = f"the scene has a transparent object (method.reflection.start_before_glass; else {reflection.start:g})"
-    return (Decision(f"reflection from {start:g} of the run on", why),)
+def _in_this_scene(config: RunConfig, transparent: bool) -> tuple[Decision, ...]:
+    """What is otherwise in this scene than in others."""
+    asked = config.method
+    used = asked.in_scene(glass=_through_glass(config, transparent))
+    found, what = [], "the scene has a transparent object"
+    if used.reflection.start != (start := asked.reflection.start):
+        why = f"{what} (method.reflection.start_before_glass; else {start:g})"
+        found.append(Decision(f"reflection from {used.reflection.start:g} of the run on", why))
+    if used.density.too_large != (large := asked.density.too_large):
+        why = f"{what} (method.transmittance.base_too_large; else {large:g})"
+        found.append(Decision(f"base surfels are too large from {used.density.too_large:g} extents on", why))
+    return tuple(found)
 
 
 def _mesh_params(config: RunConfig) -> extract_mesh.ExtractMeshParams:

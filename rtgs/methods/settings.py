@@ -266,6 +266,8 @@ class TransmittanceSettings:
     per_cell: int = 5
     most_hits: float = 80.0  # of a ray through the random set: its surfels are shrunk until no more are expected
     freeze_base: bool = True  # decision 18: density control and resets of the base set end here; False: EnvGS's windows
+    # density.too_large in scenes of this stage, where the base set has to grow sooner; None: as elsewhere.
+    base_too_large: float | None = field(default=None, metadata=UNLESS_DEFAULT)
     # Decision 21: of the mesh; "given": the scene's where the mesh is met too; "as_trained": the scene's as they are.
     test_masks: Literal["silhouette", "given", "as_trained"] = "silhouette"
     offset: float = 1e-4  # of the first bounce's start, times the extent
@@ -299,8 +301,8 @@ class TransmittanceSettings:
         refuse_unknown_words(self, "method.transmittance")
         refuse_bad_counts(self, "method.transmittance", **dict.fromkeys(_EVERY, 1))
         refuse_outside(self, "method.transmittance", 0, 3, "sh_degree")
-        if self.max_gain is not None:
-            refuse_outside(self, "method.transmittance", 0, math.inf, "max_gain")
+        given = [name for name in ("max_gain", "base_too_large") if getattr(self, name) is not None]
+        refuse_outside(self, "method.transmittance", 0, math.inf, *given)
         refuse_outside(self, "method.transmittance", 0, 1, "opaque_share", "opaque", "alpha_cutoff")
         key = "method.transmittance.start_opacity"
         refuse_unless(0 < self.start_opacity <= 1, key, self.start_opacity, "above 0 and at most 1")
@@ -398,4 +400,8 @@ class MethodSettings:
             )
         start, latest = self.reflection.start, self.reflection.start_before_glass
         start = start if latest is None or not glass else min(start, latest)
-        return replace(self, reflection=replace(self.reflection, start=start, start_before_glass=None))
+        large = self.transmittance.base_too_large
+        density = self.density if large is None or not glass else replace(self.density, too_large=large)
+        reflection = replace(self.reflection, start=start, start_before_glass=None)
+        transmittance = replace(self.transmittance, base_too_large=None)
+        return replace(self, density=density, reflection=reflection, transmittance=transmittance)

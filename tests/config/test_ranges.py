@@ -55,6 +55,7 @@ NONSENSE = [
     (PoseSettings, "rate_end", 0.0),
     (PoseSettings, "decay", math.inf),
     (EvaluationSettings, "refine_steps", 0),
+    (TransmittanceSettings, "base_too_large", -0.1),
     (TransmittanceSettings, "rim", -1),
     (TransmittanceSettings, "keep_seen", -1),
     (TransmittanceSettings, "sh_degree", 9),
