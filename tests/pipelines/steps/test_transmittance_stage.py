@@ -224,6 +224,7 @@ def test_masks_that_a_step_makes_and_that_are_empty_change_nothing(tmp_path: Pat
     capture = write_capture(tmp_path / "plain ball", "empty")
     words = ["run", f"scene={capture}", "method=rtgs", "masks=given", *QUICK, *TINY]
     words += ["method.reflection.matte.probation=0", "method.reflection.start_before_glass=null"]
+    words += ["method.transmittance.base_too_large=null"]
     assert main([*words, "name=three"]) == 0
     assert main([*words, "name=two", "ablation=two_stages"]) == 0
     three, two = tmp_path / "runs" / "three", tmp_path / "runs" / "two"
