@@ -10,13 +10,13 @@ from dataclasses import asdict, dataclass, replace
 from pipelines.planning.inspection import Inspections
 from pipelines.planning.judge import (
     Opponent,
-    exposures_as_judged,
     hold_out_views,
     judging_of,
+    photos_as_judged,
     rest_of,
     until_judged,
-    why_exposures_unseen,
     why_judged_late,
+    why_photos_unseen,
     why_unjudged,
 )
 from pipelines.planning.mask_plan import draws_panes
@@ -127,7 +127,7 @@ def build_graph(config: RunConfig, choices: Choices, inspections: Inspections | 
         mesh = extract_mesh.STEP.step(_mesh_params(config), scene, *training)
     made = (rendered, measured) if mesh is None else (mesh, rendered, measured)
     unread = find_method(config.method.name).unread_losses(config.method)
-    late = (*why_judged_late(config, opponent), *why_exposures_unseen(config))
+    late = (*why_judged_late(config, opponent), *why_photos_unseen(config))
     moved = (*_in_this_scene(config, transparency.present), *late)
     params = _report_params(config, choices, skipped, (*unread, *moved))
     page = report.STEP.step(params, *prepared.steps, scene, *training, *judge_steps, *made)
@@ -137,7 +137,12 @@ def build_graph(config: RunConfig, choices: Choices, inspections: Inspections | 
 def _rendered(config: RunConfig, scene: Step, *upstream: Step) -> Step:
     """The pictures of the test views: rendered, or another program's."""
     if not pictures_only(config):
-        params = render.RenderParams(True, config.evaluation.supersample, _refine_steps(config))
+        params = render.RenderParams(
+            maps=True,
+            supersample=config.evaluation.supersample,
+            refine_steps=_refine_steps(config),
+            refine_all=config.evaluation.refined_poses == "always",
+        )
         return render.STEP.step(params, scene, *upstream)
     return external.STEP.step(external.external_params(config.external), scene, name=render.STEP.name)
 
@@ -147,9 +152,8 @@ def _refine_steps(config: RunConfig) -> int:
     wanted, spec = config.evaluation.refined_poses, find_method(config.method.name)
     if wanted == "always":
         spec.refuse_poses(config.method, "evaluation.refined_poses=always")
-    if wanted == "always" or (wanted == "learned" and config.method.poses.enabled):
-        return config.evaluation.refine_steps
-    return 0
+    may_learn = config.method.poses.enabled or (config.method.poses.learn_above is not None and spec.learns_poses)
+    return config.evaluation.refine_steps if wanted == "always" or (wanted == "learned" and may_learn) else 0
 
 
 def _as_asked(config: RunConfig) -> RunConfig:
@@ -183,7 +187,7 @@ def _training(
     steps: list[Step] = []
     object_mesh = None
     spec = find_method(method.name)
-    method = exposures_as_judged(config, method.in_scene(glass=_through_glass(config, transparent)))
+    method = photos_as_judged(config, method.in_scene(glass=_through_glass(config, transparent)))
     if spec.elsewhere:
         return (), None
     for stage in until_judged(config, opponent, spec.timeline(method, config.schedule, transparent=transparent)):

@@ -11,6 +11,7 @@ from rtgs.config.schema import Choices, RunConfig
 from rtgs.core.decisions import Decision
 from rtgs.core.errors import RtgsError
 from rtgs.methods import Stage, find_method
+from rtgs.methods.photo_settings import AppearanceSettings, PoseSettings
 from rtgs.methods.settings import MethodSettings
 from rtgs.runs.mixture import PLAIN, REST
 from rtgs.runs.training import StageParams
@@ -50,7 +51,7 @@ class Opponent:
         if not judged(config):
             return None
         method, schedule = compose_plain(config.judge.plain, choices)
-        return Opponent(exposures_as_judged(config, method), schedule)
+        return Opponent(photos_as_judged(config, method), schedule)
 
 
 @dataclass(frozen=True)
@@ -91,21 +92,27 @@ def _learned_of_photos(config: RunConfig, opponent: Opponent) -> tuple[str, ...]
     return tuple(f"{of}.{key}.enabled" for of, own in names.items() for key in keys if getattr(own, key).enabled)
 
 
-def exposures_as_judged(config: RunConfig, method: MethodSettings) -> MethodSettings:
-    """Settings of a training whose photos join in two parts: it does not look whether their exposures differ, for those
-    that join late would come too late to learn theirs."""
+def photos_as_judged(config: RunConfig, method: MethodSettings) -> MethodSettings:
+    """Settings of a training whose photos join in two parts: it does not look whether their exposures differ or their
+    poses are unsure, for those that join late would come too late to learn theirs."""
     if not _looks_too_early(config):
         return method
-    return replace(method, appearance=replace(method.appearance, learn_above=None))
+    appearance, poses = (replace(each, learn_above=None) for each in (method.appearance, method.poses))
+    return replace(method, appearance=appearance, poses=poses)
 
 
-def why_exposures_unseen(config: RunConfig) -> tuple[Decision, ...]:
-    """Why a judged run does not look at its photos' exposures; empty: it does, or was not asked to."""
-    appearance = config.method.appearance
-    if not _looks_too_early(config) or appearance.enabled or appearance.learn_above is None:
+def why_photos_unseen(config: RunConfig) -> tuple[Decision, ...]:
+    """Why a judged run does not look at its photos' exposures and poses; empty: it does, or was not asked to."""
+    if not _looks_too_early(config):
         return ()
+    looked: dict[str, AppearanceSettings | PoseSettings] = {
+        "exposures of photos not compared": config.method.appearance
+    }
+    if find_method(config.method.name).learns_poses:
+        looked["poses of photos not judged"] = config.method.poses
+    unseen = [what for what, each in looked.items() if not each.enabled and each.learn_above is not None]
     why = f"some photos join at {config.judge.at:g} of the last stage (judge.at), too late to learn theirs"
-    return (Decision("exposures of photos not compared", why),)
+    return tuple(Decision(what, why) for what in unseen)
 
 
 def _looks_too_early(config: RunConfig) -> bool:

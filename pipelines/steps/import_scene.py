@@ -67,4 +67,4 @@ def import_scene(params: ImportParams, context: StepContext) -> None:
     save_scene(load_scene(settings), context.out)
 
 
-STEP = StepKind("import_scene", 5, import_scene)
+STEP = StepKind("import_scene", 6, import_scene)

@@ -89,6 +89,8 @@ class RenderParams:
     """Images, not maps, are rendered so many times finer and averaged."""
     refine_steps: int = field(default=0, metadata=UNLESS_DEFAULT)
     """Steps in which each view's pose is fitted to its photo for one image more; 0: there is none."""
+    refine_all: bool = field(default=False, metadata=UNLESS_DEFAULT)
+    """Fitted where the training learned no poses as well."""
     preview: int = 24
     """Frames of the looping preview; 0: none."""
 
@@ -99,11 +101,11 @@ def render(params: RenderParams, context: StepContext) -> None:
     Writes ``images/<stem>.png`` (8 bit, stems of ``unique_stems``), ``views/<stem>.safetensors`` (float32: image (3,
     H, W) not clamped, depth (H, W) z-depth divided by alpha in world units, normal (3, H, W) world frame where the
     method has one, alpha (H, W); with a third stage also ``image_given_masks``; where a judge kept the plain method
-    ``image_full``, the full one's image: maps and layers are the full method's; with ``refine_steps`` also
-    ``image_refined_pose``), ``coverage.safetensors`` (by view name (H, W) int16: training views that show what the
-    pixel shows), ``preview.webp`` (a way round the scene that plays for ever, small) and ``render.json``
-    (:class:`RenderTimes`). ``params.supersample`` is of the other images. Of methods with a far light also
-    ``environment/`` (:func:`rtgs.light.pictures.save_environment`; up is that of the cameras).
+    ``image_full``, the full one's image: maps and layers are the full method's; with ``refine_steps``, where poses were
+    learned or ``refine_all`` is on, also ``image_refined_pose``), ``coverage.safetensors`` (by view name (H, W) int16:
+    training views that show what the pixel shows), ``preview.webp`` (a way round the scene that plays for ever, small)
+    and ``render.json`` (:class:`RenderTimes`). ``params.supersample`` is of the other images. Of methods with a far
+    light also ``environment/`` (:func:`rtgs.light.pictures.save_environment`; up is that of the cameras).
     """
     import torch
     from safetensors.torch import save_file
@@ -112,6 +114,7 @@ def render(params: RenderParams, context: StepContext) -> None:
     from rtgs.evaluate.images import to_bytes, write_png
     from rtgs.light.pictures import mean_frame, save_environment
     from rtgs.methods import Mode, RenderOptions
+    from rtgs.methods.parts.poses import Poses
     from rtgs.scenes.canonical import read_scene
 
     scene = context.read("import_scene", read_scene)
@@ -152,7 +155,7 @@ def render(params: RenderParams, context: StepContext) -> None:
                 given = RenderOptions(masks="given")
                 seen = finer.full(view, given)
                 tensors[GIVEN] = (seen if mixture is None else finer.mixed(view, seen, given)).contiguous()
-        if params.refine_steps:
+        if params.refine_steps and (params.refine_all or Poses.name in method.parts):
             tensors[REFINED] = _from_refined_pose(finer, view, params.refine_steps)
         save_file(tensors, context.out / "views" / f"{stem}.safetensors")
         write_png(context.out / "images" / f"{stem}.png", to_bytes(image))

@@ -68,6 +68,7 @@ def create_method(
     from rtgs.methods.model import Model
     from rtgs.methods.parts.count_bounds import SceneCounts, bound_counts
     from rtgs.methods.parts.exposure import as_photographed
+    from rtgs.methods.parts.poses import as_posed
 
     spec = find_method(settings.name)
     if object_mesh is not None and spec.object_stage(settings) is None:
@@ -77,7 +78,8 @@ def create_method(
     counts = SceneCounts(pixels, None if drawn else len(scene.points))
     settings, lowered = bound_counts(settings.in_scene(glass=object_mesh is not None), counts)
     settings, exposures = as_photographed(settings, scene)
-    decisions = (*lowered, *exposures, *spec.unread_losses(settings))
+    settings, poses = as_posed(spec, settings, scene)
+    decisions = (*lowered, *exposures, *poses, *spec.unread_losses(settings))
     stages = spec.timeline(settings, schedule, transparent=object_mesh is not None)
     made = spec.build(
         Setup(spec, settings, scene, schedule, generator, object_mesh, stages, decisions, spec.own_settings(settings))

@@ -38,6 +38,9 @@ class PoseSettings:
     """Small motions of the training cameras, of methods that rasterise only (decision 66). Numbers of gsplat."""
 
     enabled: bool = False
+    # Learned as well, by methods that can, where a pose is unsure by more pixels of the training photos: the median
+    # standard error, from what the points of a COLMAP model miss them by. None: not looked at. Short presets.
+    learn_above: float | None = field(default=None, metadata=UNLESS_DEFAULT)
     rate: float = 1e-5  # of Adam: radians, and shares of the scene's extent
     rate_end: float = 1e-7  # at the end of the run
     decay: float = 1e-6  # of Adam's gradient per unit of motion

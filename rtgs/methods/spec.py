@@ -163,6 +163,11 @@ class MethodSpec:
             return None
         return build_checked(self.own, settings.own, "method.own")
 
+    @property
+    def learns_poses(self) -> bool:
+        """Its pictures give a gradient of the camera: it is :data:`RASTERIZED`."""
+        return RASTERIZED in self.has
+
     def refuse_poses(self, settings: MethodSettings, asked: str = "") -> None:
         """Poses of cameras are learned from what is rasterised; rays give no gradient of them.
 
@@ -171,7 +176,7 @@ class MethodSpec:
         Raises:
             RtgsError: they are to be learned, and the method is more than :data:`RASTERIZED`.
         """
-        if (asked or settings.poses.enabled) and RASTERIZED not in self.has:
+        if (asked or settings.poses.enabled) and not self.learns_poses:
             raise RtgsError(
                 f"{asked or 'method.poses.enabled=true'}, but method {self.name} is not {RASTERIZED!r} alone: the rays "
                 "that it traces from its pixels give no gradient of the camera. Leave it out, or train method=2dgs or "

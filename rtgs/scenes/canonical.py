@@ -73,6 +73,7 @@ def save_scene(scene: Scene, folder: Path) -> None:
         "source": scene.source,
         **({} if scene.noise_psnr is None else {"noise_psnr": scene.noise_psnr}),
         **({"random_points": True} if scene.random_points else {}),
+        **({} if scene.pose_error is None else {"pose_error": scene.pose_error}),
         **entries,
     }
     (folder / SCENE_FILE).write_text(json.dumps(content, indent=1), encoding="utf-8")
@@ -107,6 +108,7 @@ def read_scene(folder: Path) -> Scene:
             held=_views(folder, content.get("held", ())),
             noise_psnr=content.get("noise_psnr"),
             random_points=content.get("random_points", False) is True,
+            pose_error=content.get("pose_error"),
         )
     except CaptureError:
         raise

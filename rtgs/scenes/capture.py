@@ -47,6 +47,7 @@ class CaptureView:
     mask: Path | None = None
     normal: Path | None = None
     truth: Path | None = None  # folder of :mod:`rtgs.scenes.truth`
+    pose_error: float | None = None  # pixels of the lens: standard error of the pose; None: the capture does not tell
 
     @property
     def center(self) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -60,6 +61,7 @@ class Scene:
     held: tuple[View, ...] = ()  # neither trained on nor tested: methods are compared on them, then trained
     noise_psnr: float | None = None  # dB of the test photos against noise-free ones, mean; where that is known
     random_points: bool = False  # the points are drawn at random: no photo agrees on them
+    pose_error: float | None = None  # pixels of the training views: median standard error of a pose, where it is known
 
     @property
     def has_masks(self) -> bool:
@@ -150,20 +152,32 @@ def load_scene(settings: SceneSettings) -> Scene:
     used = [by_name[name] for name in (*sorted(inner), *split.test)]
     points, point_source, at_random = _scene_points(capture, settings, used, extent)
     record = CaptureRecord.read(capture.root)
+    train = tuple(load_view(by_name[name], settings) for name in split.train)
     scene = Scene(
         name=record.labelled(settings.name) if record else settings.name,
-        train=tuple(load_view(by_name[name], settings) for name in split.train),
+        train=train,
         test=tuple(load_view(by_name[name], settings, with_truth=True) for name in split.test),
         points=torch.from_numpy(points.positions.astype(np.float32)),
         point_colors=torch.from_numpy(points.colors.astype(np.float32)),
         extent=extent,
         held=tuple(load_view(by_name[name], settings) for name in split.held),
         random_points=at_random,
+        pose_error=_pose_error(train, by_name),
         noise_psnr=None if record is None else _noise_psnr(record, [by_name[name] for name in split.test], settings),
         source=f"{capture.format}; test views: {split.rule}; points: {point_source}{record.origin if record else ''}",
     )
     log.info("%s", scene.summary())
     return scene
+
+
+def _pose_error(views: Sequence[View], by_name: Mapping[str, CaptureView]) -> float | None:
+    """Median over the views, in their pixels; None: of half of them, or more, it is unknown."""
+    known = []
+    for view in views:
+        told, lens = by_name[view.name].pose_error, by_name[view.name].lens
+        if told is not None and lens is not None:
+            known.append(told * view.camera.width / lens.width)
+    return float(np.median(known)) if 2 * len(known) > len(views) else None
 
 
 def _noise_psnr(record: CaptureRecord, tests: list[CaptureView], settings: SceneSettings) -> float | None:

@@ -14,9 +14,10 @@ from rtgs.config import compose
 from rtgs.core.cameras import Camera
 from rtgs.core.errors import RtgsError
 from rtgs.gaussians.surfels import Surfels, activate
-from rtgs.methods import Mode, RenderOptions
+from rtgs.methods import Mode, RenderOptions, create_method, find_method
 from rtgs.methods import refine_pose as refine_pose_module
 from rtgs.methods.parts.part import Frame
+from rtgs.methods.parts.poses import as_posed
 from rtgs.methods.photo_settings import PoseSettings
 from rtgs.methods.refine_pose import refine_pose
 from rtgs.render.buffers import RasterOptions
@@ -26,6 +27,7 @@ from rtgs.render.reference import surfels as reference
 from rtgs.scenes.scene import Scene
 from rtgs.train.losses import surface_depth
 from rtgs.train.parameters import Rate
+from rtgs.train.seeds import generator_for
 from rtgs.train.trainer import Trainer
 
 TOTAL = 400
@@ -236,3 +238,50 @@ def test_decay_pulls_back():
     gradient = group["deltas"].grad  # type: ignore[index]
     assert float(gradient[1, 4]) == pytest.approx(3.0 * 0.02)
     assert int(gradient.count_nonzero()) == 1
+
+
+def test_a_border_of_poses_below_zero_is_refused():
+    with pytest.raises(RtgsError, match=r"method\.poses\.learn_above"):
+        PoseSettings(learn_above=-0.01)
+
+
+@pytest.mark.parametrize("kind", ["2dgs", "3dgs"])
+@pytest.mark.parametrize(("error", "why"), [(0.05, "unsure"), (0.03, "unsure"), (None, "does not tell")])
+def test_poses_are_learned_where_they_are_unsure(kind: str, error: float | None, why: str):
+    scene = replace(photographed(kind, views=7), pose_error=error)
+    asked = replace(plain(kind), poses=PoseSettings(learn_above=0.03))
+    method = create_method(asked, scene, steady(20), generator_for(0, "initialise"))
+    learned = error == 0.05
+    assert ("poses" in method.parts) == learned
+    what = "poses of the capture are unsure" if learned else "no poses learned"
+    (told,) = (each for each in method.decisions if each.what == what)
+    assert why in told.why
+    assert "method.poses.learn_above is 0.03" in told.why
+    assert error is None or f"{error:.3f} pixels" in told.why
+
+
+def test_nothing_is_said_of_poses_where_nobody_asked():
+    scene = replace(photographed("3dgs", views=7), pose_error=1.0)
+    spec = find_method("3dgs")
+    assert as_posed(spec, plain("3dgs"), scene) == (plain("3dgs"), ())
+    asked = replace(plain("3dgs"), poses=replace(FAST, learn_above=0.01))
+    assert as_posed(spec, asked, scene) == (asked, ())  # learned anyway
+    traced, border = replace(plain("3dgs"), poses=PoseSettings(learn_above=1.0)), find_method("envgs")
+    for error in (None, 1.0):
+        assert as_posed(border, traced, replace(scene, pose_error=error)) == (traced, ())  # it could not anyway
+
+
+def test_why_unsure_poses_are_not_learned():
+    scene = replace(photographed("3dgs", views=7), pose_error=1.0)
+    asked = replace(plain("3dgs"), poses=PoseSettings(learn_above=0.01))
+    first, second, *others = scene.train
+    twin = replace(second, camera=replace(second.camera, name=first.camera.name))
+    for spec, seen, why in (
+        (find_method("rtgs"), scene, "method rtgs traces"),
+        (find_method("3dgs"), replace(scene, train=(first, twin, *others)), "names do not tell"),
+    ):
+        settings, (told,) = as_posed(spec, asked, seen)
+        assert settings == asked
+        assert told.what == "no poses learned"
+        assert "1.000 pixels" in told.why
+        assert why in told.why

@@ -71,6 +71,8 @@ class ColmapCapture:
     names: list[str] = field(default_factory=list)
     broken_pose: int | None = None  # this view gets a NaN translation
     picture: Callable[[int], np.ndarray] | None = None
+    errors: tuple[float, ...] = ()  # reprojection errors in pixels of the first points, which every view shows
+    unseen_by: int = 0  # so many views, the first ones, show no point
 
     def write(self) -> Path:
         """Write model and photos; returns the root."""
@@ -88,12 +90,18 @@ class ColmapCapture:
             if self.broken_pose == index:
                 translation = np.array([np.nan, 0, 0])
             pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), translation)
-            model.add_image_with_trivial_frame(pycolmap.Image(name=name, camera_id=1, image_id=index + 1), pose)
+            image = pycolmap.Image(name=name, camera_id=1, image_id=index + 1)
+            image.points2D = [pycolmap.Point2D(np.array([5.0, 5.0])) for _ in range(len(self.errors) + 1)]
+            model.add_image_with_trivial_frame(image, pose)
             picture = self.picture(index) if self.picture else pinhole_picture(width=width, height=height)
             save_image(self.root / self.images_dir / name, picture)
         for _ in range(self.points):
             color = rng.integers(0, 256, 3).astype(np.uint8)
             model.add_point3D(rng.uniform(-1, 1, 3), pycolmap.Track(), color)
+        for point, error in enumerate(self.errors):
+            for image in range(self.unseen_by, len(names)):
+                model.add_observation(point + 1, pycolmap.TrackElement(image + 1, point))
+            model.points3D[point + 1].error = error
         target = self.root / self.folder
         target.mkdir(parents=True, exist_ok=True)
         (model.write_text if self.text else model.write_binary)(str(target))

@@ -61,6 +61,13 @@ def test_a_round_trip_keeps_that_points_are_random(root, tmp_path):
     assert read_scene(tmp_path / "artifact").random_points
 
 
+@pytest.mark.parametrize("error", [None, 0.0625])
+def test_a_round_trip_keeps_how_unsure_the_poses_are(root, tmp_path, error):
+    scene = replace(load_scene(SceneSettings(name="ring", path=str(root), long_side=37)), pose_error=error)
+    save_scene(scene, tmp_path / "artifact")
+    assert read_scene(tmp_path / "artifact").pose_error == error
+
+
 def test_held_out_views_are_kept_and_change_nothing_else(root, tmp_path):
     """Points, extent and the other views are those of a scene that holds out nothing."""
     settings = SceneSettings(path=str(root), long_side=37)

@@ -124,6 +124,36 @@ def test_long_side_and_ratio_average_areas(tmp_path):
     assert load(root, long_side=500).train[0].camera.width == WIDTH
 
 
+@pytest.mark.parametrize("text", [False, True])
+def test_how_unsure_poses_are_is_read_off_the_points(tmp_path, text):
+    """Standard error: the root mean square of the errors over the root of their number, in pixels of training."""
+    root = ColmapCapture(tmp_path, text=text, errors=(0.6, 0.8, 2.4)).write()
+    expected = np.sqrt((0.6**2 + 0.8**2 + 2.4**2) / 3) / np.sqrt(3)
+    assert load(root).pose_error == pytest.approx(expected)
+    assert load(root, long_side=WIDTH // 2).pose_error == pytest.approx(expected / 2)
+    assert load(root, long_side=2 * WIDTH).pose_error == pytest.approx(expected)
+
+
+def test_photos_that_were_shrunk_have_smaller_errors(tmp_path):
+    root = ColmapCapture(tmp_path, size=(128, 96), images_dir="images_2", errors=(1.0, 1.0)).write()
+    for path in (root / "images_2").iterdir():
+        save_image(path, pinhole_picture(width=64, height=48))
+    assert load(root).pose_error == pytest.approx(0.5 / np.sqrt(2))
+
+
+def test_points_without_an_error_tell_nothing(tmp_path):
+    root = ColmapCapture(tmp_path / "some", errors=(-1.0, 0.9, -1.0)).write()
+    assert load(root).pose_error == pytest.approx(0.9)
+    assert load(ColmapCapture(tmp_path / "none", errors=(-1.0, 0.0)).write()).pose_error is None
+    assert load(ColmapCapture(tmp_path / "unseen").write()).pose_error is None
+
+
+@pytest.mark.parametrize(("unseen", "told"), [(4, True), (5, False)])  # with the two for test, photos 0 and 8, left out
+def test_half_of_the_photos_must_tell(tmp_path, unseen, told):
+    root = ColmapCapture(tmp_path, errors=(0.5,), unseen_by=unseen).write()
+    assert load(root).pose_error == (pytest.approx(0.5) if told else None)
+
+
 ITSELF = """
 import sys
 from pathlib import Path

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from rtgs.core.decisions import Decision
-from rtgs.methods.parts.exposure import nearest_photos, rows_by_name, told
+from rtgs.methods.parts.exposure import have_own_names, nearest_photos, rows_by_name, told
 from rtgs.methods.parts.part import Frame, Part
 from rtgs.render.pose import NUMBERS, moved, rotation_of
 from rtgs.train.method import RenderedView
@@ -22,8 +22,9 @@ from rtgs.train.parameters import ParameterGroup, Rate
 from rtgs.train.terms import LossTerm
 
 if TYPE_CHECKING:
-    from rtgs.methods.spec import Setup
-    from rtgs.scenes.scene import View
+    from rtgs.methods.settings import MethodSettings
+    from rtgs.methods.spec import MethodSpec, Setup
+    from rtgs.scenes.scene import Scene, View
 
 NEAREST = 4  # training cameras that a test camera follows
 LIMITS = (-0.3, 0.3)  # of all numbers: beyond it poses are to be searched for anew, and within it rows stay apart
@@ -82,6 +83,29 @@ class Poses(Part):
 
         if self.decay > 0:
             yield LossTerm("pose_decay", self.decay, squares)
+
+
+def as_posed(spec: MethodSpec, settings: MethodSettings, scene: Scene) -> tuple[MethodSettings, tuple[Decision, ...]]:
+    """The settings with poses learned where those of the scene are unsure, and what decided it."""
+    poses = settings.poses
+    if poses.enabled or poses.learn_above is None:
+        return settings, ()
+    if not spec.learns_poses and (scene.pose_error is None or scene.pose_error <= poses.learn_above):
+        return settings, ()
+    key = f"method.poses.learn_above is {poses.learn_above:g}"
+    if scene.pose_error is None:
+        return settings, (Decision("no poses learned", f"the capture does not tell how sure its poses are ({key})"),)
+    unsure = f"what the points miss the photos by leaves a pose unsure by {scene.pose_error:.3f} pixels"
+    if scene.pose_error <= poses.learn_above:
+        return settings, (Decision("no poses learned", f"{unsure}, and {key}"),)
+    if not spec.learns_poses:
+        why = f"{unsure}, but the rays that method {spec.name} traces give no gradient of the camera"
+    elif not have_own_names(scene):
+        why = f"{unsure}, but names do not tell the cameras apart"
+    else:
+        asked = replace(settings, poses=replace(poses, enabled=True))
+        return asked, (Decision("poses of the capture are unsure", f"{unsure}, and {key}"),)
+    return settings, (Decision("no poses learned", why),)
 
 
 def _degrees(deltas: Tensor) -> float:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -82,7 +84,13 @@ def _read_here(settings: SceneSettings, root: Path) -> Capture:
         raise _no_images(folder)
     lenses = {key: _lens(camera, folder) for key, camera in model.cameras.items()}
     images_dir = find_images(root, settings.images_dir, [image.name for image in registered])
-    views = tuple(_view(image, lenses[image.camera_id], images_dir, root, settings) for image in registered)
+    errors = {key: float(point.error) for key, point in model.points3D.items()}
+    views = tuple(
+        replace(
+            _view(image, lenses[image.camera_id], images_dir, root, settings), pose_error=_pose_error(image, errors)
+        )
+        for image in registered
+    )
     unregistered = [image.name for image in model.images.values() if not image.has_pose]
     suffix = _model_suffix(folder)
     parts = [folder / f"{part}{suffix}" for part in (*_MODEL_PARTS, *_OPTIONAL_PARTS)]
@@ -178,6 +186,14 @@ def _view(image: Any, lens: Lens, images_dir: Path, root: Path, settings: SceneS
         normal=existing_side_file(root / normals, image.name, NORMAL_SUFFIXES) if normals else None,
         truth=existing_truth(root, image.name),
     )
+
+
+def _pose_error(image: Any, errors: dict[int, float]) -> float | None:
+    """Root mean square of its points' mean reprojection ``errors``, over the square root of their number, in pixels:
+    how far chance may have moved the picture. None: it shows no point whose error is known."""
+    shown = [errors[point.point3D_id] for point in image.points2D if point.has_point3D()]
+    known = [error for error in shown if math.isfinite(error) and error > 0]  # COLMAP writes -1 where it has none
+    return math.sqrt(sum(error**2 for error in known)) / len(known) if known else None
 
 
 def find_images(root: Path, images_dir: str | None, names: list[str]) -> Path:

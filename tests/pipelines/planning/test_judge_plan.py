@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from pipelines.planning.graph import RunGraph, build_graph, shown_values
-from pipelines.planning.judge import Opponent, until_judged, why_judged_late
+from pipelines.planning.judge import Opponent, until_judged, why_judged_late, why_photos_unseen
 from rtgs.config import compose
 from rtgs.config.compose import compose_plain
 from rtgs.config.schema import Choices
@@ -19,6 +19,7 @@ from rtgs.workflow import Store, topological
 from rtgs.workflow.expectation import Expectation, PlanClock
 from rtgs.workflow.plan import Plan, PlannedStep
 
+UNSEEN = ["exposures of photos not compared", "poses of photos not judged"]
 GLASS = ("scene=ball_statue", "method=rtgs", "preset=smoke")
 
 
@@ -95,14 +96,24 @@ def test_what_the_plain_method_learns_of_each_photo_needs_all_of_it_too():
 
 
 @pytest.mark.parametrize(("words", "looks"), [((), False), (("judge.at=1",), True), (("judge=none",), True)])
-def test_photos_that_join_late_are_not_compared_by_their_exposures(words: tuple[str, ...], looks: bool):
+def test_photos_that_join_late_are_not_looked_at(words: tuple[str, ...], looks: bool):
     found = graph(*GLASS, "judge=photos", *words)
     trainings = (*found.training, *(step for step in found.judge if step.name.startswith("plain")))
     assert all((step.params.method.appearance.learn_above is not None) is looks for step in trainings)
-    told = [each for each in found.moved if each.what == "exposures of photos not compared"]
-    assert len(told) == (not looks)
+    assert all((step.params.method.poses.learn_above is not None) is looks for step in trainings)
+    told = [each.what for each in found.moved if each.what in UNSEEN]
+    assert told == ([] if looks else UNSEEN[:1])  # nobody would have learned poses where rays are traced
     asked = graph(*GLASS, "judge=photos", "method.appearance.enabled=true", *words)
-    assert not [each for each in asked.moved if each.what == "exposures of photos not compared"]
+    assert not [each for each in asked.moved if each.what in UNSEEN]
+
+
+def test_poses_of_photos_that_join_late_are_not_judged():
+    """Of a method that could learn them."""
+    config, _ = compose([*GLASS, "judge=photos"])
+    rasterised = replace(config, method=replace(config.method, name="2dgs"))
+    assert [each.what for each in why_photos_unseen(rasterised)] == UNSEEN
+    silent = replace(rasterised.method, poses=replace(rasterised.method.poses, learn_above=None))
+    assert [each.what for each in why_photos_unseen(replace(rasterised, method=silent))] == UNSEEN[:1]
 
 
 def test_a_rest_that_a_judge_drops_says_nothing_of_the_pace(tmp_path: Path):

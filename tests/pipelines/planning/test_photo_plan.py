@@ -18,16 +18,20 @@ def planned(*words: str) -> RunGraph:
 @pytest.mark.parametrize(
     ("words", "steps"),
     [
-        (("method=2dgs",), 0),
+        (("method=2dgs",), 50),  # where the scene's poses are unsure
+        (("method=2dgs", "method.poses.learn_above=null"), 0),
+        (("method=rtgs",), 0),
         (("method=2dgs", LEARNED), 50),
         (("method=3dgs", LEARNED, "evaluation.refine_steps=20"), 20),
         (("method=2dgs", LEARNED, "evaluation.refined_poses=never"), 0),
         (("method=3dgs", "evaluation.refined_poses=always"), 50),
-        (("method=2dgs", "method.appearance.enabled=true"), 0),
+        (("method=2dgs", "evaluation.refined_poses=never"), 0),
     ],
 )
 def test_test_poses_are_refined_where_poses_are_learned_or_it_is_asked_for(words: tuple[str, ...], steps: int):
-    assert planned(*words).render.params.refine_steps == steps
+    params = planned(*words).render.params
+    assert params.refine_steps == steps
+    assert params.refine_all == ("evaluation.refined_poses=always" in words)
 
 
 def test_methods_that_trace_rays_cannot_have_them_refined():

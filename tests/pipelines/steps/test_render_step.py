@@ -37,6 +37,7 @@ class CountingMethod:
     base_depth: float = 2.0  # of the base set; what is shown lies at 2
     base_alpha: float = 1.0
     light: CubemapLight | None = None
+    parts: dict[str, object] = field(default_factory=dict)
 
     @property
     def base(self) -> CountingMethod:
@@ -140,12 +141,23 @@ def test_the_image_from_the_refined_pose_is_kept_beside_that_of_the_test(context
     method = CountingMethod(glass=False)
     monkeypatch.setattr(render, "last_training", lambda inputs: inputs["train_diffuse"])
     monkeypatch.setattr(render, "load_method", lambda folder, scene: (method, SimpleNamespace(until=100)))
-    render.render(render.RenderParams(maps=False, refine_steps=7), context)
+    render.render(render.RenderParams(maps=False, refine_steps=7, refine_all=True), context)
     assert found == [("0.png", 100, 7), ("1.png", 100, 7)]
     assert [name for name, _ in method.asked] == ["0.png", "refined 0.png", "1.png", "refined 1.png"]
     timed = render.read_timed(context.out, render.RenderTimes.read(context.out), "1.png")
     assert timed.refined is not None
     assert torch.equal(timed.refined, timed.image)  # of this method, which shows every camera the same
+
+
+@pytest.mark.parametrize("learned", [True, False])
+def test_poses_are_refined_where_the_training_learned_them(context, monkeypatch, learned) -> None:
+    monkeypatch.setattr("rtgs.methods.refine_pose.refine_pose", lambda method, view, step, *, steps: view.camera)
+    monkeypatch.setattr(render, "last_training", lambda inputs: inputs["train_diffuse"])
+    method = CountingMethod(glass=False, parts={"poses": object()} if learned else {})
+    monkeypatch.setattr(render, "load_method", lambda folder, scene: (method, SimpleNamespace(until=100)))
+    render.render(render.RenderParams(maps=False, refine_steps=7, preview=0), context)
+    timed = render.read_timed(context.out, render.RenderTimes.read(context.out), "1.png")
+    assert (timed.refined is not None) is learned
 
 
 @pytest.mark.parametrize("judged", [True, False])
@@ -162,7 +174,7 @@ def test_the_image_from_the_refined_pose_is_made_as_the_other_is(context, monkey
 
     monkeypatch.setattr("rtgs.methods.refine_pose.refine_pose", refined)
     monkeypatch.setattr(render, "read_mixture", lambda inputs, scene: Judge() if judged else None)
-    params = render.RenderParams(maps=False, supersample=times, refine_steps=7, preview=0)
+    params = render.RenderParams(maps=False, supersample=times, refine_steps=7, refine_all=True, preview=0)
     run(context, CountingMethod(glass=False), monkeypatch, maps=False, params=params)
     timed = render.read_timed(context.out, render.RenderTimes.read(context.out), "1.png")
     assert timed.refined is not None
