@@ -85,9 +85,18 @@ def test_the_presets_below_a_preset_are_those_it_lists():
     assert {name.split("/")[1] for name, _ in presets() if "/" in name} == set(choices_of("preset")) - published
 
 
-def test_standard_of_rtgs_restates_nothing_of_what_it_takes():
-    below = layers("rtgs", ["short_presets", "preset/standard", "quick_recipe"])
-    assert idle(stated("method_in_preset/standard_rtgs"), [below]) == []
+TWICE_QUICK = ("2dgs", "3dgs", "rtgs")  # in standard
+
+
+def test_twice_quick_restates_nothing_of_what_it_takes():
+    below = [layers(method, ["short_presets", "preset/standard", "quick_recipe"]) for method in TWICE_QUICK]
+    assert idle(stated("twice_quick"), below) == []
+
+
+@pytest.mark.parametrize("method", TWICE_QUICK)
+def test_standard_of_a_method_restates_nothing_of_what_it_takes(method):
+    below = layers(method, ["short_presets", "preset/standard", "quick_recipe", "twice_quick"])
+    assert idle(stated(f"method_in_preset/standard_{method}"), [below]) == []
 
 
 @pytest.mark.parametrize("ablation", [name for name in choices_of("ablation") if name != "none"])
