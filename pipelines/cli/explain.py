@@ -14,6 +14,7 @@ from rtgs.config.keys import Key, config_keys, own_keys, sentence_of, value_of, 
 from rtgs.config.locate import project_root
 from rtgs.config.opened import OPTIONS, friendly_words, split_config_dir, with_configs
 from rtgs.config.provenance import settings_of
+from rtgs.config.steps import is_scaled
 from rtgs.core.credentials import redact
 from rtgs.core.errors import RtgsError
 from rtgs.core.listing import columns
@@ -62,6 +63,8 @@ def one_key(key: Key, config: RunConfig, words: Sequence[str]) -> str:
     """All that is known of a key in the run of these words."""
     rows = [("value", redact(str(value_of(config, key.name))))]
     rows.append(("set in", _set_in((key.name,), keys_of(config), words)))
+    if config.steps_scaler != 1 and is_scaled(key.name):
+        rows.append(("times", f"steps_scaler={config.steps_scaler:g}"))
     source = Path(inspect.getfile(key.owner)).resolve()
     if source.is_relative_to(project_root()):  # not of a method from outside
         source = source.relative_to(project_root())

@@ -10,6 +10,7 @@ from omegaconf import DictConfig
 from rtgs.config.convert import to_run_config, with_own
 from rtgs.config.opened import opened_configs
 from rtgs.config.schema import Choices, RunConfig, register_schema
+from rtgs.config.steps import scaled_steps
 from rtgs.config.words import unresolved
 from rtgs.core.build import build
 from rtgs.core.credentials import redact
@@ -37,7 +38,7 @@ def compose(overrides: Sequence[str]) -> tuple[RunConfig, Choices]:
 
 def compose_plain(method: str, choices: Choices) -> tuple[MethodSettings, ScheduleSettings]:
     """Another method's own numbers at the preset of a run, and the schedule they give; of what the run sets by word,
-    keys of ``schedule`` hold for it as well.
+    keys of ``schedule`` and ``steps_scaler`` hold for it as well.
 
     Raises:
         hydra.errors.HydraException: no such method or preset.
@@ -48,7 +49,8 @@ def compose_plain(method: str, choices: Choices) -> tuple[MethodSettings, Schedu
 
     chosen = {"scene": choices.scene_file, "preset": choices.preset}
     words = [f"method={method}", *(f"{group}={name}" for group, name in chosen.items() if name)]
-    words += [word for word in choices.overrides if word.lstrip("+~").startswith("schedule.")]
+    shared = ("schedule.", "steps_scaler=")
+    words += [word for word in choices.overrides if word.lstrip("+~").startswith(shared)]
     register_schema()
     if GlobalHydra.instance().is_initialized():  # in a job: it knows the folders that the command line adds
         composed = hydra_compose("config", overrides=words)
@@ -59,7 +61,8 @@ def compose_plain(method: str, choices: Choices) -> tuple[MethodSettings, Schedu
     assert isinstance(found, dict)
     assert isinstance(schedule, dict)
     own = with_own(build(MethodSettings, {str(key): value for key, value in found.items()}))
-    return own, build(ScheduleSettings, {str(key): value for key, value in schedule.items()})
+    steps = build(ScheduleSettings, {str(key): value for key, value in schedule.items()})
+    return scaled_steps(own, steps, float(composed.steps_scaler))
 
 
 def without_hydra(composed: DictConfig) -> DictConfig:

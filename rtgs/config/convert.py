@@ -15,6 +15,7 @@ from rtgs.config.locate import choices_of, conf_dir
 from rtgs.config.names import derive_name, run_name
 from rtgs.config.opened import more_choices
 from rtgs.config.schema import Choices, RunConfig
+from rtgs.config.steps import scaled_steps
 from rtgs.config.words import FOLDER_CHOICE, quoted, unresolved
 from rtgs.core.build import build
 from rtgs.core.credentials import ADDRESSES, hide
@@ -50,7 +51,8 @@ def to_run_config(composed: DictConfig, choices: Choices) -> tuple[RunConfig, Ch
     _refuse_preset_of_others(config, choices)
     _refuse_idle_ablation(config, choices)
     config = _of_external(config)
-    config = replace(config, method=with_own(config.method))
+    method, schedule = scaled_steps(with_own(config.method), config.schedule, config.steps_scaler)
+    config = replace(config, method=method, schedule=schedule)
     find_method(config.method.name).refuse_poses(config.method)
     scene = config.scene
     if config.table.data == "paper" and scene.path.startswith("embedded:"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import math
 import typing
 from dataclasses import dataclass, field
 from functools import cache
@@ -175,6 +176,8 @@ class RunConfig:
     normals: NormalSettings = field(default_factory=NormalSettings)
     method: MethodSettings = field(default_factory=MethodSettings)
     schedule: ScheduleSettings = field(default_factory=ScheduleSettings)
+    steps_scaler: float = 1.0
+    """As gsplat's: every number of steps of the schedule and the method times this, in the end (docs/training.md)."""
     watch: WatchSettings = field(default_factory=WatchSettings)
     evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
     external: ExternalSettings = field(default_factory=ExternalSettings)
@@ -197,6 +200,8 @@ class RunConfig:
     def __post_init__(self) -> None:
         refuse_below("seed", self.seed, 0)
         refuse_below("threads", self.threads, 1)
+        scaler = self.steps_scaler
+        refuse_unless(0 < scaler < math.inf, "steps_scaler", scaler, "above 0 and finite")
         refuse_unless(self.threads is None or self.threads <= _MOST_THREADS, "threads", self.threads, "at most 1024")
 
 
