@@ -59,6 +59,7 @@ def test_what_is_off_stays_off_and_nothing_vanishes():
     assert (shorter.total, shorter.densify_every, shorter.sh_every) == (1, 1, 10)
     assert (shorter.opacity_reset_every, shorter.evaluate_every, shorter.sh_from) == (0, 0, 0)
     assert method.reflection.propagation.every == 10
+    assert scaled_steps(settings, ScheduleSettings(), 0.29)[1].densify_every == 29  # 28.999... by the machine
     assert scaled_steps(settings, schedule, 1.0) == (settings, schedule)
 
 

@@ -67,6 +67,15 @@ def test_a_key_is_told_with_value_default_place_and_sentence():
     assert explained("mesh.source")["choices"] == "auto, hull, tsdf, given"
 
 
+def test_a_number_of_steps_is_told_as_it_is_scaled():
+    rows = explained("schedule.total", "preset=quick", "steps_scaler=0.5")
+    assert (rows["value"], rows["set in"], rows["times"]) == ("1000", "conf/preset/quick.yaml", "steps_scaler=0.5")
+    assert explained("method.reflection.sh_every", "steps_scaler=2")["times"] == "steps_scaler=2"
+    assert "times" not in explained("schedule.checkpoint_every", "steps_scaler=0.5")
+    assert "times" not in explained("schedule.total", "preset=quick")
+    assert explained("steps_scaler", "steps_scaler=0.5")["value"] == "0.5"
+
+
 def test_where_a_value_is_that_of_another_key_the_places_of_that_key_are_told():
     words = ("scene=ref_real/sedan", "method=envgs", "preset=paper")
     rows = explained("schedule.total", *words)
