@@ -15,12 +15,12 @@ RUN ?=
 MINUTES ?= 30
 FIRST ?= 0
 HOURS ?= 1
-# of the tables: PRESET smoke quick standard paper (PRESETS several, of time-quality); SEEDS how many; DATA stand_in ref_real nu_nerf (with DATA_ROOT); WORKERS
+# of the tables: PRESET smoke quick standard paper (PRESETS several, of time-quality); SEEDS how many; DATA stand_in ref_real nu_nerf (with DATA_ROOT); WORKERS (0: by cores, memory and jobs)
 PRESET ?= quick
 SEEDS ?= 1
 DATA ?= stand_in
 PRESETS ?= quick,standard
-WORKERS ?= 2
+WORKERS ?= 0
 DATA_ROOT ?= data
 export DATA_ROOT
 comma := ,

@@ -12,7 +12,7 @@ import os
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -25,6 +25,7 @@ from rtgs.workflow.plan import Plan
 from rtgs.workflow.progress import plan_progress
 from rtgs.workflow.remote import RemoteStore
 from rtgs.workflow.resources import Room, StepNeeds, by_step, bytes_of
+from rtgs.workflow.spread import best_spread, machine_cores, machine_memory
 from rtgs.workflow.step import Step
 from rtgs.workflow.store import Store
 from rtgs.workflow.wire import TlsFiles, check_tls, tls_config
@@ -43,7 +44,8 @@ class EngineSettings:
 
     kind: EngineKind = "local"
     """``local`` processes, ``ssh`` hosts, ``slurm`` jobs, or the ``address`` of a scheduler that is running."""
-    workers: int = 2
+    workers: int = 0
+    """0: on this machine as many as bring a sweep's jobs soonest, by how trainings scale; elsewhere 2."""
     most_workers: int = 0
     """kind=local and slurm: as many workers as there is work for, from ``workers`` up to this. 0: always those."""
     threads: int = 0
@@ -81,11 +83,13 @@ class EngineSettings:
 
     def __post_init__(self) -> None:
         refuse_unknown_words(self, "hydra.launcher")
-        if self.workers < 1 or self.threads < 0 or self.retries < 0:
+        if self.workers < 0 or self.threads < 0 or self.retries < 0:
             raise RtgsError(
-                f"hydra.launcher: workers={self.workers} must be at least 1, threads={self.threads} and "
-                f"retries={self.retries} at least 0"
+                f"hydra.launcher: workers={self.workers}, threads={self.threads} and retries={self.retries} must be at "
+                "least 0"
             )
+        if not self.workers and self.kind != "local":
+            object.__setattr__(self, "workers", min(2, self.most_workers or 2))
         self._check_most()
         self._check_needs()
         needed = {"address": self.address, "ssh": len(self.hosts) > 1, "slurm": self.memory != "auto"}
@@ -93,6 +97,15 @@ class EngineSettings:
             what = {"address": "address=tcp://...", "ssh": "at least two hosts", "slurm": "memory=8GB"}[self.kind]
             raise RtgsError(f"hydra.launcher.kind={self.kind} needs hydra.launcher.{what}")
         check_tls(self.tls_files, self.address)
+
+    def for_jobs(self, jobs: int) -> EngineSettings:
+        """With a number of workers, and of their threads, for so many jobs."""
+        if self.workers:
+            return self
+        if self.most_workers:  # they come with the work
+            return replace(self, workers=1)
+        chosen = best_spread(max(jobs, 1), machine_cores(), machine_memory(), self.threads)
+        return replace(self, workers=chosen.workers, threads=chosen.threads)
 
     @property
     def tls_files(self) -> TlsFiles:
@@ -114,7 +127,8 @@ class EngineSettings:
         for name, threads in needs.threads.items():
             if threads > most:
                 raise RtgsError(f"hydra.launcher.step_threads: {name} wants {threads} threads, there are {most}")
-        share = self._known_memory * (self.worker_limit if self.kind == "local" else 1)
+        workers = self.worker_limit if self.workers else machine_cores()  # at most
+        share = self._known_memory * (workers if self.kind == "local" else 1)
         for name, memory in needs.memory.items():
             if share and memory > share:
                 raise RtgsError(f"hydra.launcher.step_memory: {name} wants {memory} bytes, there are {share}")
@@ -148,14 +162,14 @@ class EngineSettings:
     @property
     def worker_limit(self) -> int:
         """How many workers there can be."""
-        return max(self.workers, self.most_workers)
+        return max(self.workers, self.most_workers, 1)
 
     @property
     def worker_threads(self) -> int:
         """Threads of one worker, decided."""
         if self.threads:
             return self.threads
-        return max(1, _cores() // self.worker_limit) if self.kind == "local" else 1
+        return max(1, machine_cores() // self.worker_limit) if self.kind == "local" else 1
 
 
 @dataclass(frozen=True)
@@ -278,6 +292,7 @@ def open_client(settings: EngineSettings) -> Iterator[Client]:
             "hydra/launcher=rtgs_dask needs Dask: pip install -e '.[cluster]' in the clone of rtgs"
         ) from error
     logging.getLogger("distributed").setLevel(logging.WARNING)  # importing it sets INFO, over what conf/hydra says
+    settings = settings.for_jobs(machine_cores())
     at_start = worker_environment(settings.worker_threads)
     limits = {
         "distributed.scheduler.allowed-failures": settings.retries,
@@ -382,7 +397,3 @@ def worker_environment(threads: int) -> Mapping[str, str]:
     names = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
     kept = {"MALLOC_TRIM_THRESHOLD_": str(256 << 20), "MALLOC_MMAP_THRESHOLD_": str(32 << 20)}  # bytes; glibc's largest
     return {**dict.fromkeys(names, str(threads)), "OMP_WAIT_POLICY": "passive", **kept}
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

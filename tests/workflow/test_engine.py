@@ -212,7 +212,7 @@ def _count_faults(params: ToyParams, context) -> None:
     ("settings", "message"),
     [
         ({"kind": "cloud"}, "kind='cloud' is unknown"),
-        ({"workers": 0}, "workers=0 must be at least 1"),
+        ({"workers": -1}, "workers=-1, threads=0 and retries=3 must be at least 0"),
         ({"kind": "address"}, "address=tcp"),
         ({"kind": "slurm"}, "memory=8GB"),
         ({"kind": "ssh", "hosts": ["one"]}, "at least two hosts"),

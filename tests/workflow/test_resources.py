@@ -144,11 +144,11 @@ def test_a_limited_step_does_not_hold_others_back():
         ({"step_threads": ["sfm:4", "sfm:5"]}, "each step once"),
         ({"step_threads": ["sfm:0"]}, "whole number of 1 to 1024"),
         ({"step_limit": ["sfm:" + "9" * 400]}, "whole number of 1 to 1024"),
-        ({"step_threads": ["sfm:9"], "threads": 2}, "sfm wants 9 threads, there are 4"),
+        ({"workers": 2, "step_threads": ["sfm:9"], "threads": 2}, "sfm wants 9 threads, there are 4"),
         ({"step_threads": ["sfm:3"], "threads": 2, "kind": "slurm", "memory": "8GB"}, "wants 3 threads, there are 2"),
         ({"step_memory": ["sfm:plenty"]}, "'plenty' must be a size such as 8GB"),
         ({"step_memory": ["sfm:9GB"], "memory": "4GB"}, "sfm wants 9000000000 bytes"),
-        ({"most_workers": 1}, "most_workers=1 is less than workers=2"),
+        ({"workers": 2, "most_workers": 1}, "most_workers=1 is less than workers=2"),
         ({"most_workers": 4, "kind": "ssh", "hosts": ["a", "b"]}, "the workers of kind=ssh are given"),
     ],
 )
