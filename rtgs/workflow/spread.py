@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 SERIAL = 0.25
 """Share of a training that more threads do not shorten, measured: .18 to .25 on two cores, .21 to .33 on sixteen
-(docs/lab/threads.md, "Where it stands" and "Sixteen cores")."""
+(docs/lab/threads.md, "More than one scene at a time")."""
 JOB_BYTES = 2 * 2**30
 """Memory to have for each job: trainings take .9 to 1.5 GB."""
 
@@ -27,7 +27,7 @@ def training_time(threads: int) -> float:
 
 
 def best_spread(jobs: int, cores: int, memory: float, threads: int = 0) -> Spread:
-    """The spread with which ``jobs`` of equal length, worker by worker, are done first; of equals that with most workers.
+    """With which ``jobs`` of equal length are done first; of equals the one of most workers.
 
     Args:
         jobs: at least 1.
