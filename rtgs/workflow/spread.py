@@ -27,7 +27,7 @@ def training_time(threads: int) -> float:
 
 
 def best_spread(jobs: int, cores: int, memory: float, threads: int = 0) -> Spread:
-    """With which ``jobs`` of equal length are done first; of equals the one of most workers.
+    """The spread that has ``jobs`` of equal length done first; of equals the one of most workers.
 
     Args:
         jobs: at least 1.
