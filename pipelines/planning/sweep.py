@@ -117,9 +117,7 @@ def run_merged(jobs: Sequence[Job], settings: EngineSettings, shown: Shown) -> S
     if plan.complete:
         return SweepOutcomes({})
     settings.needs.check(kind.name for kind in KINDS)
-    ahead = {planned.step.fingerprint for planned in plan if not planned.hit}
-    left = sum(any(step.fingerprint in ahead for step in topological(graph.targets)) for _, graph in merged.graphs)
-    settings = settings.for_jobs(left)
+    settings = settings.for_jobs(len(merged.graphs))  # done or not: who goes on has the threads it began with
     announced = shown(merged, plan)
     with open_client(settings) as client:
         outcomes = DaskExecutor(client, _worker_job(config, settings), settings.room()).attempt(plan)

@@ -7,7 +7,7 @@ import os
 from dataclasses import dataclass
 
 SERIAL = 0.25
-"""Share of a training that more threads do not shorten, measured: .18 to .25 on two cores, .21 to .33 on sixteen
+"""Share of a training that more threads do not shorten, measured: .18 to .39 on two cores, .21 to .33 on sixteen
 (docs/lab/threads.md, "More than one scene at a time")."""
 JOB_BYTES = 2 * 2**30
 """Memory to have for each job: trainings take .9 to 1.5 GB."""
