@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import platform
 import sys
 from dataclasses import asdict, dataclass, field
@@ -13,7 +14,6 @@ from typing import Any
 from rtgs.core.documents import load_json
 from rtgs.core.files import sha256_of
 from rtgs.core.version import VERSION
-from rtgs.workflow.spread import machine_cores
 from rtgs.workflow.step import Step
 
 NAME = "manifest.json"
@@ -109,7 +109,7 @@ def machine() -> dict[str, Any]:
     record: dict[str, Any] = {
         "processor": platform.processor() or platform.machine(),
         "system": platform.system(),
-        "cores": machine_cores(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
     }
     torch, core = sys.modules.get("torch"), sys.modules.get("rtgs.native._core")
     if torch is not None:
