@@ -16,6 +16,7 @@ from rtgs.core.cameras import Camera
 from rtgs.core.decisions import Decision
 from rtgs.methods.parts.base import BaseSet
 from rtgs.methods.parts.glass import Glass
+from rtgs.methods.parts.glass_evidence import has_masks
 from rtgs.methods.settings import MethodSettings
 from rtgs.methods.shading.straight import FirstBounce, depth_loss, mesh_normal_loss
 from rtgs.pretrained.weights import MissingWeights
@@ -31,7 +32,7 @@ from rtgs.train.method import RenderedView, RenderOptions
 from rtgs.train.perceptual import PerceptualLoss
 from rtgs.train.schedule import loss_start
 from rtgs.train.settings import LossSettings
-from rtgs.train.terms import LossTerm, term_start
+from rtgs.train.terms import LossTerm, TermValue, term_start
 
 if TYPE_CHECKING:
     from rtgs.methods.spec import Setup
@@ -59,39 +60,49 @@ def surface_terms(setup: Setup) -> Terms:
     """Normal consistency, monocular normals, distortion (method.md 5)."""
     loss, ratio = setup.settings.loss, setup.settings.render.depth_ratio
 
-    def start(name: str, weight: float, share: float) -> int | Decision:
-        return term_start(name, weight, share, setup.schedule.total, setup.settings.name)
-
     def consistency(rendered: RenderedView, view: View) -> Tensor:
         return _normal_consistency(rendered.buffers, rendered.camera, loss, ratio)
-
-    def mono(rendered: RenderedView, view: View) -> Tensor | None:
-        return None if view.normal is None else _mono_normal(rendered.buffers, view, rendered.camera, loss)
 
     def distortion(rendered: RenderedView, view: View) -> Tensor:
         assert rendered.buffers.distortion is not None
         return distortion_loss(rendered.buffers.distortion)
 
-    mono_weight = loss.mono_normal * loss.mono_normal_gain
+    def term(name: str, called: str, share: float, value: TermValue, needs: RenderOptions) -> LossTerm | Decision:
+        weight = getattr(loss, name)
+        first = term_start(called, weight, share, setup.schedule.total, setup.settings.name)
+        return first if isinstance(first, Decision) else LossTerm(name, weight, value, first, needs=needs)
+
     both = RenderOptions(depth=ratio < 1, median_depth=ratio > 0, normal=True)
-    normals = RenderOptions(depth=loss.normal_inverse_depth, normal=True)
+    return (
+        term("normal", "normal consistency", loss.normal_start, consistency, both),
+        *_mono_terms(setup),
+        term("distortion", "distortion", loss.distortion_start, distortion, RenderOptions(distortion=True)),
+    )
+
+
+def _mono_terms(setup: Setup) -> Terms:
+    """L_mono; of two weights, one after the other, where nothing is transparent and the settings say so."""
+    loss, total = setup.settings.loss, setup.schedule.total
+    weight, times = loss.mono_normal * loss.mono_normal_gain, loss.mono_normal_opaque
     found: list[LossTerm | Decision] = []
-    for name, first, term in (
-        ("normal", start("normal consistency", loss.normal, loss.normal_start), (loss.normal, consistency, both)),
-        (
-            "mono_normal",
-            _mono_start(setup, start("monocular normal", mono_weight, loss.mono_normal_start), found),
-            (mono_weight, mono, normals),
-        ),
-        (
-            "distortion",
-            start("distortion", loss.distortion, loss.distortion_start),
-            (loss.distortion, distortion, RenderOptions(distortion=True)),
-        ),
-    ):
-        weight, value, needs = term
-        found.append(first if isinstance(first, Decision) else LossTerm(name, weight, value, first, needs=needs))
-    return found
+    start = term_start("monocular normal", weight, loss.mono_normal_start, total, setup.settings.name)
+    first = _mono_start(setup, start, found)
+    if isinstance(first, Decision):
+        return (*found, first)
+
+    def value(rendered: RenderedView, view: View) -> Tensor | None:
+        return None if view.normal is None else _mono_normal(rendered.buffers, view, rendered.camera, loss)
+
+    needs = RenderOptions(depth=loss.normal_inverse_depth, normal=True)
+    until = round(loss.mono_normal_opaque_until * total)
+    if times != 1 and first < until and not has_masks(setup.scene.train):
+        why = f"no training view of scene {setup.scene.name} has a mask of a transparent object"
+        found.append(Decision(f"monocular normals count {times:g} times until step {until}", why))
+        found.append(LossTerm("mono_normal", weight * times, value, first, until=until, needs=needs))
+        first = until
+    if first < total:
+        found.append(LossTerm("mono_normal", weight, value, first, needs=needs))
+    return tuple(found)
 
 
 def _mono_start(setup: Setup, start: int | Decision, found: list[LossTerm | Decision]) -> int | Decision:

@@ -292,6 +292,62 @@ def test_a_gain_of_zero_leaves_a_term_out():
     assert "no monocular normal loss" in {decision.what for decision in method.decisions}
 
 
+@pytest.mark.parametrize(
+    ("times", "until", "masks", "early", "late"),
+    [
+        (3.0, 1.0, "", 0.3, 0.3),
+        (3.0, 0.5, "", 0.3, 0.1),
+        (3.0, 0.5, "empty", 0.3, 0.1),
+        (3.0, 0.5, "glass", 0.1, 0.1),
+        (3.0, 0.0, "", 0.1, 0.1),
+        (0.5, 0.5, "", 0.05, 0.1),
+        (1.0, 0.5, "", 0.1, 0.1),
+    ],
+)
+def test_monocular_normals_count_more_at_first_where_nothing_is_transparent(
+    times: float, until: float, masks: str, early: float, late: float
+):
+    loss = LossSettings(
+        mono_normal=0.01, mono_normal_gain=10.0, mono_normal_opaque=times, mono_normal_opaque_until=until
+    )
+    scene = small_scene(normals=True)
+    if masks:
+        mask = torch.zeros_like(scene.train[0].image[0], dtype=torch.bool)
+        mask[:, :5] = masks == "glass"
+        scene = replace(scene, train=(scene.train[0], replace(scene.train[1], mask=mask), *scene.train[2:]))
+    method = create_method(replace(small_method(), loss=loss), scene, small_schedule(), generator_for(0, "initialise"))
+    for step, weight in ((0, early), (29, early), (30, late), (59, late)):
+        terms, _ = train_step(method, scene, step)
+        assert [term.weight for term in terms.terms if term.name == "mono_normal"] == [pytest.approx(weight)]
+    said = [decision for decision in method.decisions if decision.what.startswith("monocular normals count")]
+    assert [str(decision) for decision in said] == [
+        f"monocular normals count {times:g} times until step {round(60 * until)}: no training view of scene small "
+        "has a mask of a transparent object"
+    ] * (early != 0.1)
+
+
+def test_two_weights_of_monocular_normals_begin_after_their_start():
+    loss = LossSettings(mono_normal=0.01, mono_normal_start=0.6, mono_normal_opaque=3.0, mono_normal_opaque_until=0.5)
+    method, scene = make(replace(small_method(), loss=loss), normals=True)
+    for step, weights in ((0, []), (30, []), (36, [0.01])):
+        terms, _ = train_step(method, scene, step)
+        assert [term.weight for term in terms.terms if term.name == "mono_normal"] == weights
+    assert not any(decision.what.startswith("monocular normals count") for decision in method.decisions)
+
+
+@pytest.mark.parametrize(("key", "value"), [("mono_normal_opaque", 0.0), ("mono_normal_opaque_until", 1.5)])
+def test_weights_of_monocular_normals_that_make_no_sense_are_refused(key: str, value: float):
+    with pytest.raises(ValueError, match=f"method.loss.{key}={value:g}"):
+        LossSettings(**{key: value})
+
+
+def test_where_no_view_has_normals_nothing_is_said_of_how_much_they_count():
+    loss = LossSettings(mono_normal=0.01, mono_normal_opaque=3.0)
+    method, _ = make(replace(small_method(), loss=loss))
+    told = [decision.what for decision in method.decisions if "monocular" in decision.what]
+    assert told == ["no monocular normal loss"]
+
+
 def test_names_of_parts_and_of_what_they_save_are_their_own():
     method, scene = make()
     setup = Setup(find_method("2dgs"), method.settings, scene, method.schedule, method.generator)
