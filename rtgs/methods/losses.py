@@ -88,7 +88,7 @@ def _mono_terms(setup: Setup) -> Terms:
     start = term_start("monocular normal", weight, loss.mono_normal_start, total, setup.settings.name)
     first = _mono_start(setup, start, found)
     if isinstance(first, Decision):
-        return (*found, first)
+        return (first,)
 
     def value(rendered: RenderedView, view: View) -> Tensor | None:
         return None if view.normal is None else _mono_normal(rendered.buffers, view, rendered.camera, loss)

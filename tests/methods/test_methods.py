@@ -326,6 +326,16 @@ def test_monocular_normals_count_more_at_first_where_nothing_is_transparent(
     ] * (early != 0.1)
 
 
+def test_each_surface_loss_begins_by_itself_with_the_maps_it_needs():
+    loss = LossSettings(
+        normal=0.04, normal_start=0.5, normal_inverse_depth=True, mono_normal=0.01, distortion=10, distortion_start=0.25
+    )
+    method, scene = make(replace(small_method(), loss=loss), normals=True)
+    for step, names in ((0, []), (15, ["distortion"]), (30, ["normal", "distortion"])):
+        terms, _ = train_step(method, scene, step)
+        assert {term.name for term in terms.terms} == {"l1", "dssim", "mono_normal", *names}
+
+
 def test_two_weights_of_monocular_normals_begin_after_their_start():
     loss = LossSettings(mono_normal=0.01, mono_normal_start=0.6, mono_normal_opaque=3.0, mono_normal_opaque_until=0.5)
     method, scene = make(replace(small_method(), loss=loss), normals=True)
