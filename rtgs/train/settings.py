@@ -38,10 +38,10 @@ class LossSettings:
     mono_normal: float = 0.0  # RT-GS 0.01; only where the scene has normals
     mono_normal_gain: float = 1.0  # times its weight: short presets (docs/lab/reflection.md); 1: published
     mono_normal_masked: float = 1.0  # times that again in masks of transparent objects (docs/lab/transmittance.md)
-    # Monocular normals count so many times more where no mask shows a transparent object (docs/lab/reflection.md,
-    # "Normals that make a mirror").
+    # A further factor on monocular normals where no mask shows a transparent object
+    # (docs/lab/reflection.md, "Normals that make a mirror").
     mono_normal_opaque: float = field(default=1.0, metadata=UNLESS_DEFAULT)
-    mono_normal_opaque_until: float = field(default=1.0, metadata=UNLESS_DEFAULT)  # share of the run; then once
+    mono_normal_opaque_until: float = field(default=1.0, metadata=UNLESS_DEFAULT)  # share of the run that it lasts
     mono_normal_start: float = 0.0  # EnvGS: from 0
     mono_normal_form: MonoNormalForm = "cosine"  # the paper: 1 - n.N; "envgs": |difference|_1 + 1 - cos
     distortion: float = 0.0  # 2DGS: 0 unbounded, 1000 bounded
