@@ -154,9 +154,7 @@ class EngineSettings:
         each, none = self.worker_threads, 2**62
         if self.kind != "local":
             return Room(self.needs, none, none, each)
-        from distributed.system import MEMORY_LIMIT
-
-        memory = self._known_memory * self.worker_limit or MEMORY_LIMIT
+        memory = self._known_memory * self.worker_limit or int(machine_memory())
         return Room(self.needs, each * self.worker_limit, memory, each)
 
     @property
