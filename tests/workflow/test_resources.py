@@ -163,6 +163,21 @@ def test_other_spellings_of_dasks_memory_stay():
         EngineSettings(memory="0.5", step_memory=["sfm:8GB"])
 
 
+@pytest.mark.parametrize(
+    ("settings", "most"),
+    [
+        ({}, 2),  # workers whose memory nobody said share the machine's 10 GB
+        ({"memory": "6GB"}, 3),
+        ({"kind": "slurm", "memory": "6GB"}, 5),  # each has its machine to itself
+    ],
+)
+def test_how_many_steps_of_four_gigabytes_run_at_once(settings, most, monkeypatch):
+    monkeypatch.setattr("rtgs.workflow.engine.machine_memory", lambda: 10e9)
+    room = EngineSettings(workers=2, threads=4, step_threads=["sfm:1"], step_memory=["sfm:4GB"], **settings).room()
+    assert room
+    assert [room.take("sfm") for _ in range(5)] == [True] * most + [False] * (5 - most)
+
+
 def test_needs_of_steps_that_there_are_not_are_refused():
     with pytest.raises(RtgsError, match="step 'sfn' are given; the steps are sfm"):
         EngineSettings(step_limit=["sfn:1"]).needs.check(["sfm"])
