@@ -1,5 +1,6 @@
 """Settings and fixtures shared by all tests."""
 
+import gc
 import os
 from collections.abc import Iterator
 
@@ -13,6 +14,12 @@ from rtgs.native import core
 # the change under test. `HYPOTHESIS_PROFILE=default pytest` searches at random; so does `make fuzz`.
 settings.register_profile("repeatable", derandomize=True, database=None)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "repeatable"))
+
+
+def pytest_collection_finish() -> None:
+    """Modules and thousands of tests are no garbage: the collector passes by them."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(autouse=True)

@@ -14,7 +14,7 @@ from typing import Protocol
 from filelock import Timeout
 
 from rtgs.core.credentials import redact
-from rtgs.core.memory import collect_and_hand_back
+from rtgs.core.memory import collect_and_hand_back, spare_what_is_loaded
 from rtgs.core.recipe import flatten
 from rtgs.core.work_time import work_time
 from rtgs.track import NullTracking, RunInfo, Tracking
@@ -179,6 +179,7 @@ class InlineExecutor:
         inputs = {other.name: self.store.folder(other) for other in step.upstream}
         tags = {f"rtgs.upstream.{other.name}": other.fingerprint for other in step.upstream}
         info = RunInfo(STEPS_EXPERIMENT, step.label, step.fingerprint, {STEP_TAG: step.name, **tags})
+        spare_what_is_loaded()
         start, cpu = time.perf_counter(), work_time()
         try:
             with self.tracking.run(info) as tracker:
