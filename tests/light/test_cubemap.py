@@ -56,8 +56,8 @@ def test_all_gradients_are_those_of_differences(settings: CubemapSettings, activ
     settings = replace(settings, activate=activate)
     raw = texels(settings)
     generator = torch.Generator().manual_seed(2)
-    directions = torch.nn.functional.normalize(torch.randn(12, 3, generator=generator, dtype=torch.float64), dim=1)
-    roughness = 0.05 + 0.9 * torch.rand(12, generator=generator, dtype=torch.float64)
+    directions = torch.nn.functional.normalize(torch.randn(5, 3, generator=generator, dtype=torch.float64), dim=1)
+    roughness = torch.linspace(0.07, 0.93, 5, dtype=torch.float64)  # between all levels
 
     def lit(part: torch.Tensor, directions: torch.Tensor, roughness: torch.Tensor) -> torch.Tensor:
         changed = raw.clone()
