@@ -103,7 +103,7 @@ reproduce-time-quality: setup ## PSNR over CPU time for every method and preset,
 	$(TABLE) experiment=time_quality $(RUN)
 
 test: setup-dev ## the tests
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not slow"
 
 fuzz: setup-dev ## damaged files against every reader for MINUTES, ends with counts (FIRST= number of the first input)
 	$(BIN)/python -m tests.fuzz.attack --minutes $(MINUTES) --first $(FIRST)

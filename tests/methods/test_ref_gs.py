@@ -128,7 +128,9 @@ def test_shading_has_the_gradients_of_finite_differences(which: int):
         found = mirrored_light({**weights, "weight0": first}, box_pyramid(texels), 16, rays, roughness, surface)
         return encoded(0.02 + found[:4], "linear")
 
-    assert torch.autograd.gradcheck(color, given[which], eps=1e-7, atol=1e-5, nondet_tol=1e-12)
+    # of the 8,192 texels along random directions, of all else one by one
+    fast = given[which] is given[0]
+    assert torch.autograd.gradcheck(color, given[which], eps=1e-7, atol=1e-5, nondet_tol=1e-12, fast_mode=fast)
 
 
 @BOTH
