@@ -69,7 +69,7 @@ $(READY_DEV): $(READY)
 	@touch $(READY_DEV)
 	@echo "$(VENV) takes $$(du -sh $(VENV) | cut -f1)B"
 
-demo: setup ## train the embedded glass scene, end with a page of pictures and numbers (about 4 minutes)
+demo: setup ## train the embedded glass scene, end with a page of pictures and numbers (about 3 minutes)
 	$(BIN)/rtgs run scene=demo method=rtgs preset=quick $(RUN)
 
 reproduce-table1: setup ## mirrors: every method on every scene, ends with tables/table1-PRESET (PRESET= SEEDS= DATA= WORKERS=)
