@@ -57,7 +57,7 @@ def test_all_gradients_are_those_of_differences(settings: CubemapSettings, activ
     raw = texels(settings)
     generator = torch.Generator().manual_seed(2)
     directions = torch.nn.functional.normalize(torch.randn(5, 3, generator=generator, dtype=torch.float64), dim=1)
-    roughness = torch.linspace(0.07, 0.93, 5, dtype=torch.float64)  # between all levels
+    roughness = torch.linspace(0.07, 0.91, 5, dtype=torch.float64)  # between all levels, on none
 
     def lit(part: torch.Tensor, directions: torch.Tensor, roughness: torch.Tensor) -> torch.Tensor:
         changed = raw.clone()
