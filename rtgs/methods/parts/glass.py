@@ -56,6 +56,8 @@ _BEGUN = "third_stage"  # in the state: the stage has begun
 _GLASS = "glass_faces"
 _LEFT_OUT = "third_stage_left_out"  # instead of both
 
+_NONE_BESIDE = Decision("nothing mirrors beside the transparent object", "method.transmittance.mirrors_beside is false")
+
 
 class Glass(Part):
     """A transmittance set and an interface on the object's mesh: image = ... + k_s w_t C_t in transparent objects.
@@ -122,7 +124,8 @@ class Glass(Part):
         asking = self.settings.single_rays if self.settings.transmittance.contents == "rasterized" else ""
         traced = (Decision("contents are traced", f"{asking} needs the hits of single rays"),) if asking else ()
         bare = views_without_glass(self.settings.transmittance, self._all_views) if self.begun else ()
-        return (*traced, *bare, *(decision for each in self._learners for decision in each.decisions))
+        matte = (_NONE_BESIDE,) if self.begun and not self.settings.transmittance.mirrors_beside else ()
+        return (*traced, *bare, *matte, *(decision for each in self._learners for decision in each.decisions))
 
     def mask(self, view: View) -> Tensor | None:
         """L_spec acts in masks that bound something, unless the stage was left out."""
@@ -215,7 +218,8 @@ class Glass(Part):
         flat = mirror.surface(raster.buffers)
         bend = None if self.vertices is None else self.vertices.bend(frame.step)
         glass = self.pixels(frame, flat, bend)
-        chosen = mirror.choose(frame, raster.buffers, glass.flat, always=glass.inside)
+        beside = self.settings.transmittance.mirrors_beside
+        chosen = mirror.choose(frame, raster.buffers, glass.flat, always=glass.inside, others=beside)
         straight = glass_rays(glass, chosen.index, rays.center, rays.rows)
         if self.wall is not None:
             self.wall.set_for(frame.step if frame.training and frame.step < self.plan.judged else None)

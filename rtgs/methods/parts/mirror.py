@@ -199,13 +199,21 @@ class Mirror(Part):
 
     @torch.no_grad()
     def choose(
-        self, frame: Frame, buffers: RasterBuffers, flat: SurfacePixels, always: Tensor | None = None
+        self,
+        frame: Frame,
+        buffers: RasterBuffers,
+        flat: SurfacePixels,
+        *,
+        always: Tensor | None = None,
+        others: bool = True,
     ) -> TracedPixels:
-        """Which pixels are traced, which of them share a ray; ``always`` (H * W,) bool: each by a ray of its own."""
+        """Which pixels are traced, which of them share a ray; ``always`` (H * W,) bool: each by a ray of its own, and
+        without ``others`` none but these."""
         settings, traced = self.settings.reflection, self.settings.reflection.traced
         if not frame.training or frame.step < self.plan.judged:  # k_s has to tell the mirrors from the rest first
             traced = replace(traced, shared_below=0.0)
         there = surface_there(flat, buffers.alpha.flatten(), settings.smallest_alpha)
+        there = there if others or always is None else there & always
         showing = None
         if traced.threshold > 0 or traced.shared_below > 0:
             showing = showing_reflection(flat, lambda: frame.rays.directions, self.settings.optics)
