@@ -47,11 +47,14 @@ def test_pixels_beside_the_object_show_their_own_colours(mode: Mode, monkeypatch
     assert [each.what for each in method.decisions].count(WHAT) == 1
 
 
-def test_a_scene_with_mirrors_keeps_them(monkeypatch: pytest.MonkeyPatch):
-    method = begun(glass_recipe(), made)
+@pytest.mark.parametrize(
+    "changes", [{}, {"mirrors_beside": False, "first_bounce": "none"}], ids=["as it is", "no rays in glass at all"]
+)
+def test_a_scene_with_mirrors_keeps_them(changes: dict[str, object], monkeypatch: pytest.MonkeyPatch):
+    method = begun(glass_recipe(**changes), made)
     randomised(method)
     rendered, rays = shown(method, Mode.EVALUATE, monkeypatch)
-    glass = rendered.maps["transparent"]
+    glass = made.scene.train[0].mask
     assert glass is not None
     assert rendered.layers is not None
     assert rays > int(glass.sum())

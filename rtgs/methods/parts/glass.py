@@ -124,7 +124,7 @@ class Glass(Part):
         asking = self.settings.single_rays if self.settings.transmittance.contents == "rasterized" else ""
         traced = (Decision("contents are traced", f"{asking} needs the hits of single rays"),) if asking else ()
         bare = views_without_glass(self.settings.transmittance, self._all_views) if self.begun else ()
-        matte = (_NONE_BESIDE,) if self.begun and not self.settings.transmittance.mirrors_beside else ()
+        matte = (_NONE_BESIDE,) if self._shades and not self.settings.transmittance.mirrors_beside else ()
         return (*traced, *bare, *matte, *(decision for each in self._learners for decision in each.decisions))
 
     def mask(self, view: View) -> Tensor | None:
@@ -210,9 +210,13 @@ class Glass(Part):
 
     # ---- rendering
 
+    @property
+    def _shades(self) -> bool:
+        return self.begun and self.settings.transmittance.first_bounce != "none"
+
     def shade(self, frame: Frame, raster: Raster) -> RenderedView | None:
         """What the mirror shows, and in transparent objects what straight rays meet."""
-        if not self.begun or self.settings.transmittance.first_bounce == "none":
+        if not self._shades:
             return None
         mirror, rays, shape = self.mirror, frame.rays, (frame.camera.height, frame.camera.width)
         flat = mirror.surface(raster.buffers)
