@@ -244,4 +244,4 @@ def _steps(context: StepContext) -> tuple[StepLine, ...]:
     return tuple(lines)
 
 
-STEP = StepKind("report", 10, report)
+STEP = StepKind("report", 11, report)

@@ -24,9 +24,15 @@ LAYERS = {"reflection": "reflected", "transmission": "transmitted"} | {name: nam
 BASE = "base"  # of methods that add the reflection: what is left of the image without it
 
 
+def share_of_base(maps: Mapping[str, Tensor]) -> Tensor:
+    """(H, W) of C_d in an image with these layers: 1 - k_s, and 1 in pixels that were not traced."""
+    share = 1 - maps["specular"]
+    return torch.where(maps["traced"] > 0.5, share, 1.0) if "traced" in maps else share
+
+
 def added_by_base(maps: Mapping[str, Tensor]) -> Tensor:
-    """(3, H, W) what the base set adds to an image with these layers: (1 - k_s) C_d, or the layer ``base``."""
-    return maps[BASE] if BASE in maps else (1 - maps["specular"]) * maps["diffuse"]
+    """(3, H, W) what the base set adds to an image with these layers: its share of C_d, or the layer ``base``."""
+    return maps[BASE] if BASE in maps else share_of_base(maps) * maps["diffuse"]
 
 
 class LayerTruth(SurfaceTruth, Protocol):

@@ -42,7 +42,7 @@ class _At(torch.autograd.Function):
     def forward(ctx, values: Tensor, vertices: Tensor, shares: Tensor):
         ctx.count = len(values)
         ctx.save_for_backward(vertices, shares)
-        found = values.detach().index_select(0, vertices.flatten()).reshape(*vertices.shape, -1)
+        found = values.detach().index_select(0, vertices.flatten()).reshape(*vertices.shape, values.shape[1])
         return (found * shares.to(values.dtype)[..., None]).sum(1)
 
     @staticmethod

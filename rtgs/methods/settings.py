@@ -225,7 +225,8 @@ class TransmittanceSettings:
     start: float = 1 / 3  # share of the run: 20,000 of 60,000
     # Until this share of the run the stage sees views of half the size (docs/lab/glass_light.md); 0: none.
     half_size_until: float = field(default=0.0, metadata=UNLESS_DEFAULT)
-    # Surfaces beside the object mirror in this stage, too. Where none does, False saves a seventh of the time.
+    # Surfaces beside the object mirror in this stage, too. Where none does, False saves a seventh of the time;
+    # with first_bounce "none" it says nothing.
     mirrors_beside: bool = field(default=True, metadata=UNLESS_DEFAULT)
     # Decision 26: what it meets; "base": the base set inside; "none": nothing.
     first_bounce: Literal["transmittance", "base", "none"] = "transmittance"

@@ -13,7 +13,7 @@ from torch import Tensor
 from rtgs.core.cameras import Camera
 from rtgs.core.errors import RtgsError
 from rtgs.evaluate.images import to_bytes
-from rtgs.evaluate.layers import BASE, added_by_base
+from rtgs.evaluate.layers import BASE, added_by_base, share_of_base
 from rtgs.report.figures import DepthPicture, depth_picture, normal_picture
 
 SHOWN = ("final", "diffuse", "reflection", "transmission", "normal", "depth", "weights")
@@ -80,7 +80,7 @@ def shown_layer(name: str, maps: Mapping[str, Tensor], camera: Camera, depths: D
         return _depth(maps, depths)
     if name == "weights":
         passed = maps.get("transmission_weight")
-        own = torch.ones_like(maps["specular"]) if BASE in maps else 1 - maps["specular"]
+        own = torch.ones_like(maps["specular"]) if BASE in maps else share_of_base(maps)
         return to_bytes(
             torch.stack((maps["reflection_weight"], own, torch.zeros_like(own) if passed is None else passed))
         )

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from rtgs.evaluate.images import to_bytes
-from rtgs.evaluate.layers import BASE
+from rtgs.evaluate.layers import BASE, share_of_base
 from rtgs.optics.light import decoded, encoded
 from rtgs.report.shown import SHOWN, layers_of, shown_layer
 from rtgs.train.losses import surface_depth
@@ -101,9 +101,7 @@ def _part(name: str, maps: Mapping[str, Tensor], blend: str) -> Tensor:
         return decoded(maps[name].contiguous(), blend)
     if BASE in maps:  # the method adds its reflection to the whole of the base
         return decoded(maps[BASE].contiguous(), blend)
-    own = decoded(maps[OWN].contiguous(), blend)
-    share = 1 - maps["specular"]
-    return own * (torch.where(maps["traced"] > 0.5, share, 1.0) if "traced" in maps else share)
+    return decoded(maps[OWN].contiguous(), blend) * share_of_base(maps)
 
 
 def pixels_of(choice: Choice, maps: Mapping[str, Tensor], camera: Camera, blend: str) -> np.ndarray:

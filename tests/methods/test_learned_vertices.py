@@ -67,6 +67,21 @@ def test_the_picture_teaches_them_through_reflections_and_the_light_inside(made:
     assert not torch.allclose(found[0], found[1]), "what is mirrored inside teaches as well"
 
 
+def test_a_view_that_looks_past_the_object_teaches_them_nothing(made: GlassScene):
+    method = begun(learning(), made)
+    randomised(method)
+    _, vertices = part_of(method)
+    camera = made.scene.train[0].camera
+    turn = torch.diag(torch.tensor([-1.0, 1.0, -1.0], dtype=torch.float64))
+    away = replace(camera, rotation=turn @ camera.rotation, translation=turn @ camera.translation)
+    rendered = method.render(away, STEP, Mode.TRAIN)
+    assert not bool(rendered.maps["transparent"].any())
+    heights, colors = vertices.group["heights"], method["base"].gaussians["sh_dc"]
+    of_vertices, of_base = torch.autograd.grad(rendered.image.sum(), (heights, colors), allow_unused=True)
+    assert of_vertices is None or not bool(of_vertices.any())
+    assert bool(of_base.any())
+
+
 def test_before_their_start_they_stand_still(made: GlassScene):
     method = begun(learning(replace(LEARNED, start=0.5)), made)
     _, vertices = part_of(method)

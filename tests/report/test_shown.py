@@ -45,6 +45,14 @@ def test_every_layer_is_what_its_name_says():
     assert np.abs(np.subtract(value["weights"], (127.5, 191.25, 25.5))).max() <= 0.5
 
 
+def test_pixels_that_were_not_traced_show_the_base_set_alone():
+    traced = torch.ones(HEIGHT, WIDTH)
+    traced[0, 1] = 0
+    diffuse, weights = (shown_layer(name, maps(traced=traced), CAMERA, None) for name in ("diffuse", "weights"))
+    assert [tuple(diffuse[0, column]) for column in (0, 1)] == [(76, 76, 76), (102, 102, 102)]
+    assert [int(weights[0, column, 1]) for column in (0, 1)] == [191, 255]
+
+
 def test_depth_keeps_its_colours_from_frame_to_frame():
     near, far = maps(), maps(depth=maps()["depth"] + 2)
     depths = DepthRange.of([near, far])
