@@ -282,4 +282,4 @@ def _sizes(mesh: TriangleMesh) -> dict[str, float]:
     return {"mesh/vertices": float(len(mesh.vertices)), "mesh/triangles": float(len(mesh.faces))}
 
 
-STEP = StepKind("extract_mesh", 8, extract_mesh)
+STEP = StepKind("extract_mesh", 9, extract_mesh)

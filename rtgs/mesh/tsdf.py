@@ -18,7 +18,7 @@ from torch import Tensor
 from rtgs.core.cameras import Camera
 from rtgs.core.errors import RtgsError
 from rtgs.mesh.settings import TsdfSettings
-from rtgs.mesh.triangles import TriangleMesh
+from rtgs.mesh.triangles import TriangleMesh, in_order
 
 BLOCK = 8  # voxels along the side of a block
 
@@ -169,7 +169,7 @@ class _Fusion:
         vertices = found.vertex.positions.numpy() if "positions" in found.vertex else np.empty((0, 3), np.float32)
         faces = found.triangle.indices.numpy() if "indices" in found.triangle else np.empty((0, 3), np.int32)
         colors = np.clip(found.vertex.colors.numpy(), 0, 1) if with_color and len(vertices) else None
-        whole = TriangleMesh(vertices, faces, colors)
+        whole = in_order(TriangleMesh(vertices, faces, colors))  # Open3D's threads number it as they take turns
         mesh, clusters, kept = largest_pieces(whole, settings.keep_clusters, settings.min_triangles)
         if len(mesh.faces) == 0:
             raise RtgsError(

@@ -11,7 +11,7 @@ import torch
 from rtgs.core.cameras import Camera
 from rtgs.core.errors import RtgsError
 from rtgs.mesh.settings import TsdfSettings
-from rtgs.mesh.triangles import TriangleMesh, read_mesh_ply, write_mesh_obj, write_mesh_ply
+from rtgs.mesh.triangles import TriangleMesh, in_order, read_mesh_ply, write_mesh_obj, write_mesh_ply
 from rtgs.mesh.tsdf import (
     DepthView,
     MeshResult,
@@ -70,6 +70,52 @@ def test_sphere_is_recovered_within_a_voxel() -> None:
     assert volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.03)  # closed, and normals point outwards
     assert result.mesh.colors is not None
     np.testing.assert_allclose(result.mesh.colors.mean(0), [0.2, 0.5, 0.8], atol=2e-3)
+
+
+def renumbered(mesh: TriangleMesh, seed: int) -> TriangleMesh:
+    """The same surface with vertices and faces at random places, and faces that begin with a random corner."""
+    random = np.random.default_rng(seed)
+    order = random.permutation(len(mesh.vertices))
+    faces = order.argsort()[mesh.faces][random.permutation(len(mesh.faces))]
+    turned = (random.integers(3, size=(len(faces), 1)) + np.arange(3)) % 3
+    colors = None if mesh.colors is None else mesh.colors[order]
+    return TriangleMesh(mesh.vertices[order], np.take_along_axis(faces, turned, 1), colors)
+
+
+def same(a: TriangleMesh, b: TriangleMesh) -> bool:
+    pairs = ((a.vertices, b.vertices), (a.faces, b.faces), (a.colors, b.colors))
+    return all(np.array_equal(mine, theirs) for mine, theirs in pairs)  # None equals None
+
+
+def test_fusing_again_gives_the_same_bits() -> None:
+    settings = TsdfSettings(depth_trunc=6.0, voxel=6.0 / 160)
+    meshes = [fused(sphere_views(), settings).mesh for _ in range(3)]
+    assert same(meshes[0], meshes[1])
+    assert same(meshes[0], meshes[2])
+    assert same(meshes[0], in_order(renumbered(meshes[0], 0)))  # whatever Open3D's threads made of it
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_numbers_say_nothing_of_an_ordered_mesh(seed: int) -> None:
+    """Two cubes touch in four points, which are vertices of both; one vertex has no face, none a colour."""
+    whole = join(sphere(1.0, rings=12), box((1, -1, -1), (2, 1, 1)), box((2, -1, -1), (3, 1, 1)))
+    whole = replace(whole, vertices=np.concatenate([whole.vertices, [[0.5, 0, 0]]]), colors=None)
+    found, again = in_order(whole), in_order(renumbered(whole, seed))
+    assert same(found, again)
+    assert len(found.vertices) == len(whole.vertices) - 1
+    assert len(found.faces) == len(whole.faces)
+    assert corners(found) == corners(whole)
+
+
+def corners(mesh: TriangleMesh) -> list[list[tuple[float, ...]]]:
+    """Of each face, from the least on in the face's own turn; sorted."""
+    faces = ([tuple(mesh.vertices[number].tolist()) for number in face] for face in mesh.faces)
+    return sorted(min(face[k:] + face[:k] for k in range(3)) for face in faces)
+
+
+def test_no_face_is_no_surface() -> None:
+    empty = in_order(TriangleMesh(np.ones((2, 3)), np.empty((0, 3))))
+    assert empty.vertices.shape == empty.faces.shape == (0, 3)
 
 
 def test_derived_lengths_are_those_of_2dgs() -> None:

@@ -40,7 +40,7 @@ from tests.pipelines.app_cases import QUICK, _in_root, capture, root  # noqa: F4
 from tests.pipelines.steps.test_transmittance_stage import TINY, write_capture
 
 JUDGED = ("judge=photos", *QUICK)
-SPOILT_GLASS = ("method.transmittance.rate_gain=3000.0", "method.transmittance.wall.index=2.5")
+SPOILT_GLASS = ("method.transmittance.rate_gain=100000.0", "method.transmittance.wall.index=2.5")
 
 
 def folders(run: Path) -> dict[str, Path]:
