@@ -53,7 +53,8 @@ def edges_of(faces: np.ndarray, count: int) -> np.ndarray:
 
 def in_order(mesh: TriangleMesh) -> TriangleMesh:
     """The same surface with faces by where their corners are, the first corner first, and vertices as faces name them.
-    Two meshes that differ in nothing but numbers become one, to the bit. Vertices of no face go."""
+    Two meshes that differ in nothing but numbers become one, to the bit, unless two faces have the same three points.
+    Vertices of no face go."""
     order = np.lexsort(mesh.vertices.T[::-1])
     place = np.zeros(len(order), np.int64)  # among all points; of vertices at one point the same
     place[order[1:]] = (np.diff(mesh.vertices[order], axis=0) != 0).any(1).cumsum()
