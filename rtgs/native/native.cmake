@@ -12,6 +12,7 @@ set(RTGS_KERNELS
   image/srgb.cpp
   image/blend.cpp
   image/wall.cpp
+  image/wall_weights.cpp
   light/lookup.cpp
   light/filter.cpp
   light/features.cpp
@@ -37,6 +38,7 @@ set(RTGS_BINDINGS
   common/memory.cpp
   common/pool.cpp
   common/threads.cpp
+  image/sensor.cpp
   bind/image.cpp
   bind/activation.cpp
   bind/optimizer.cpp
@@ -50,6 +52,7 @@ set(RTGS_BINDINGS
   image/surface.cpp
   bind/surface.cpp
   bind/wall.cpp
+  bind/wall_weights.cpp
   light/border.cpp
   bind/light.cpp
   bind/features.cpp

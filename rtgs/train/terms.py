@@ -16,6 +16,9 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from rtgs.core.decisions import Decision
+from rtgs.native import core
+from rtgs.native.arrays import arrays_of
+from rtgs.native.threads import threads
 from rtgs.train.losses import photometric_loss
 from rtgs.train.method import LossValue, LossValues, RenderedView, RenderOptions
 from rtgs.train.schedule import loss_start
@@ -108,24 +111,32 @@ class LossTable:
 
 def as_the_sensor(image: Tensor, photo: Tensor) -> Tensor:
     """(3, H, W) the image, no brighter than 1 where the photo is at its brightest value; there is no gradient from what
-    is cut off."""
-    return _AsTheSensor.apply(image, photo)  # type: ignore[return-value]
+    is cut off. float32 by a native kernel, any other dtype in plain torch."""
+    if all(each.dtype == torch.float32 and each.device.type == "cpu" for each in (image, photo)):
+        return _AsTheSensor.apply(image, photo)  # type: ignore[return-value]
+    return as_the_sensor_twin(image, photo)
+
+
+def as_the_sensor_twin(image: Tensor, photo: Tensor) -> Tensor:
+    """:func:`as_the_sensor` in plain torch."""
+    return image.masked_fill((photo >= BRIGHTEST) & (image > 1), 1.0)
 
 
 class _AsTheSensor(torch.autograd.Function):
-    """One mask and one copy each way: chained operations of torch make five maps of the picture's size."""
-
     @staticmethod
     def forward(ctx, image: Tensor, photo: Tensor) -> Tensor:
-        cut = (photo >= BRIGHTEST).logical_and_(image > 1)
-        ctx.save_for_backward(cut)
-        return image.masked_fill(cut, 1.0)
+        cut = torch.empty(image.shape)
+        ctx.save_for_backward(image, photo)
+        core.cut_light(*arrays_of(image, photo), BRIGHTEST, *arrays_of(cut), threads())
+        return cut
 
     @staticmethod
     @once_differentiable
     def backward(ctx, upstream: Tensor):  # type: ignore[override]
-        (cut,) = ctx.saved_tensors
-        return upstream.masked_fill(cut, 0.0), None
+        gradient = torch.empty(upstream.shape)
+        given = (*arrays_of(*ctx.saved_tensors), BRIGHTEST, *arrays_of(upstream, gradient))
+        core.cut_light_backward(*given, threads())
+        return gradient, None
 
 
 def table_of(settings: LossSettings, terms: Iterable[LossTerm]) -> LossTable:

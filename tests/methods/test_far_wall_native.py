@@ -12,10 +12,11 @@ from test_inner_native import TINT, assert_close
 from torch import Tensor
 
 from rtgs.methods import Mode, RenderOptions
-from rtgs.methods.parts import straight_rays
+from rtgs.methods.parts import glass, straight_rays
 from rtgs.methods.shading import inner
 from rtgs.methods.shading.far_wall import Behind, seen_through, seen_through_twin
 from rtgs.methods.shading.inner import leg_light_twin
+from rtgs.methods.shading.wall_weights import wall_weights_twin
 from rtgs.native import core
 from rtgs.optics.dielectric import wall_reflectance_twin
 
@@ -137,8 +138,9 @@ def test_a_whole_view_and_its_gradients_are_as_with_the_twins(
     native = found()
     monkeypatch.setattr(inner, "leg_light", leg_light_twin)
     monkeypatch.setattr(straight_rays, "seen_through", seen_through_twin)
-    for place in ("rtgs.methods.parts.wall_light", "rtgs.methods.shading.inner", "rtgs.methods.shading.outline"):
-        monkeypatch.setattr(f"{place}.wall_reflectance", wall_reflectance_twin)
+    monkeypatch.setattr(glass, "wall_weights", wall_weights_twin)
+    for place in ("inner", "outline", "wall_weights"):
+        monkeypatch.setattr(f"rtgs.methods.shading.{place}.wall_reflectance", wall_reflectance_twin)
     plain = found()
     assert not all(torch.equal(one, other) for one, other in zip(native, plain, strict=True))
     for one, other in zip(native, plain, strict=True):

@@ -16,7 +16,7 @@ from rtgs.methods.reads import as_lit
 from rtgs.methods.settings import MethodSettings
 from rtgs.methods.shading.blend import sum_of_lights
 from rtgs.methods.shading.lights import Light
-from rtgs.methods.shading.outline import Outline, covering, with_beside
+from rtgs.methods.shading.outline import Outline, beside_light, beside_share, covering
 from rtgs.optics.dielectric import wall_reflectance
 from rtgs.optics.light import decoded, encoded
 
@@ -61,6 +61,13 @@ def shown(side: int, cover: float = 0.9) -> tuple[Tensor, Tensor]:
     total = sum(each.weight for each in lights)
     assert isinstance(total, Tensor)
     return light, total
+
+
+def with_beside(lights: tuple[Light, ...], specular: Tensor, outline: Outline, beside: Tensor) -> tuple[Light, ...]:
+    """The lights, dimmed where something is seen beside the object, and that."""
+    share = beside_share(specular, outline)
+    dimmed = [replace(each, weight=each.weight * (1 - share)) for each in lights]
+    return (*dimmed, beside_light(outline, share, beside))
 
 
 def color(light: float, count: int) -> Tensor:

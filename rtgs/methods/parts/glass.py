@@ -35,8 +35,9 @@ from rtgs.methods.plans import transmittance_plan
 from rtgs.methods.shading.bent import Bend, bent_paths
 from rtgs.methods.shading.lights import Light, Traced, lit_view, mean_of_lights
 from rtgs.methods.shading.mirror import SurfacePixels, reflected_weight
-from rtgs.methods.shading.outline import Outline, with_beside
+from rtgs.methods.shading.outline import Outline, beside_light
 from rtgs.methods.shading.straight import GlassPixels, Transmission, glass_rays, glass_weights
+from rtgs.methods.shading.wall_weights import WallWeights, wall_weights
 from rtgs.train.method import Observation, RenderedView, RenderOptions, Stage, StepEvent
 from rtgs.train.parameters import ParameterGroup
 from rtgs.train.schedule import (
@@ -232,9 +233,9 @@ class Glass(Part):
         shown = GlassView(frame, chosen, glass, straight, outline, bend)
         aside = None if outline is None else rays.rows(chosen.index[outline.rows[outline.partly]])
         samples = [self._sample(shown, each, None if number else aside) for number, each in enumerate(scatters)]
-        (met, passed, _), lights = samples[0], mean_of_lights([lights for _, _, lights in samples])
-        if outline is not None and passed.beside is not None:
-            lights = with_beside(lights, met.pixels.specular, outline, passed.beside)
+        (met, passed, weights, _), lights = samples[0], mean_of_lights([lights for *_, lights in samples])
+        if outline is not None and weights.beside is not None and passed.beside is not None:
+            lights = (*lights, beside_light(outline, weights.beside, passed.beside))
         maps = {"transparent": glass.inside.reshape(shape), "specular": flat.specular.reshape(shape)}
         seen = (*met.observations, *passed.observations)
         traced = Traced(glass.flat, chosen, met.pixels, lights, maps, passed.first_bounce, seen)
@@ -242,8 +243,8 @@ class Glass(Part):
 
     def _sample(
         self, shown: GlassView, scatter: Scatter | None, aside: Tensor | None
-    ) -> tuple[Reflected, Transmission, tuple[Light, ...]]:
-        """What one ray of each kind meets behind each traced pixel, and the lights of it; ``scatter``: rough walls;
+    ) -> tuple[Reflected, Transmission, WallWeights, tuple[Light, ...]]:
+        """What one ray of each kind meets behind each traced pixel, weights and lights of it; ``scatter``: rough walls;
         ``aside``: directions of rays beside the object, as :meth:`StraightRays.transmit` has them."""
         frame, chosen, rays = shown.frame, shown.chosen, shown.rays
         pixels = chosen.index[rays.rows]
@@ -254,13 +255,13 @@ class Glass(Part):
         bent = None if scatter is None else bent_rays(shown, scatter)
         met = self.mirror.reflect(frame, chosen, shown.glass.flat, leaving, None if bent is None else bent.mirrored)
         inside = shown.glass.inside[chosen.index]
-        reflection, transmission = self.weights(met, inside, frame.camera, chosen.index, shown.outline)
+        weights = self.weights(met, inside, frame.camera, chosen.index, shown.outline)
         near, onward = (rays, None) if bent is None else (bent.near, bent.far)
         wall = None if self.wall is None else FarWall(inner, met.others, self.wall.index, self.wall.tint)
         passed = self._straight(frame).transmit(frame, near, pixels, wall, onward, aside)
-        through = Light("transmission", "transmitted_color", transmission, passed.color, passed.parts)
-        own, *coats = self.mirror.lights(met, reflection, inside)
-        return met, passed, (own, through, *coats)
+        through = Light("transmission", "transmitted_color", weights.transmission, passed.color, passed.parts)
+        own, *coats = self.mirror.lights(met, weights.reflection, inside)
+        return met, passed, weights, (own, through, *coats)
 
     def appended(self, frame: Frame) -> Rows | None:
         """The interface: it is rasterised with the base set, as its surface in the object's pixels."""
@@ -285,18 +286,19 @@ class Glass(Part):
 
     def weights(
         self, met: Reflected, inside: Tensor, camera: Camera, pixels: Tensor, outline: Outline | None
-    ) -> tuple[Tensor, Tensor]:
-        """w_r and w_t of the traced ``pixels`` (P,), with the S_max and the bound of the object's; ``inside`` (P,)
+    ) -> WallWeights:
+        """Of the lights of the traced ``pixels`` (P,), with the S_max and the bound of the object's; ``inside`` (P,)
         bool."""
         settings, optics, cosine = self.settings.transmittance, self.settings.optics, met.cosine
         bounded = settings.max_weight > 0 and settings.interface.count > 0
         reflection = reflected_weight(cosine, met.pixels, optics)
         if self.wall is not None:
-            rows = inside.nonzero()[:, 0]
-            return self.wall.weights(reflection, cosine, rows, self.wall.walls(camera, pixels[rows]), outline)
+            shown = self.wall.shown(camera, pixels, inside, outline)
+            return wall_weights(reflection, cosine, met.pixels.specular, shown)
         optics = optics if settings.max_gain is None else replace(optics, max_gain=settings.max_gain)
         largest = settings.max_weight if bounded else 0.0
-        return glass_weights(reflection, cosine, met.pixels, inside, optics, largest, settings.weight_bound)
+        found = glass_weights(reflection, cosine, met.pixels, inside, optics, largest, settings.weight_bound)
+        return WallWeights(*found, beside=None)
 
     def _straight(self, frame: Frame) -> StraightRays:
         assert self.guide is not None

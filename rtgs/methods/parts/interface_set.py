@@ -9,11 +9,11 @@ import torch
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from rtgs.gaussians.activate import activate_geometry
 from rtgs.gaussians.density import logit
 from rtgs.gaussians.harmonics import rest_count
 from rtgs.gaussians.initialize import neighbor_distance
 from rtgs.gaussians.materials import with_materials
-from rtgs.gaussians.primitives import tangents
 from rtgs.gaussians.surfels import Surfels
 from rtgs.mesh.container import ObjectMesh
 from rtgs.methods.parts.gaussian_set import GaussianSet
@@ -42,7 +42,8 @@ class InterfaceSet(GaussianSet):
         return (1 - (self._normals() * self.normals).sum(-1)).mean()
 
     def _normals(self) -> Tensor:
-        return torch.linalg.cross(*tangents(self.gaussians.quaternions))
+        active = activate_geometry(self.gaussians)
+        return torch.linalg.cross(active.tangent_u, active.tangent_v)
 
     def state(self) -> dict[str, Tensor]:
         return super().state() | {f"{self.name}.{_NORMALS}": self.normals}

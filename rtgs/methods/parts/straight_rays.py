@@ -17,6 +17,7 @@ from rtgs.methods.parts.wall_light import InnerRays
 from rtgs.methods.settings import MethodSettings
 from rtgs.methods.shading.far_wall import Behind, seen_through
 from rtgs.methods.shading.inner import LINEAR, TracedLeg, inner_light
+from rtgs.methods.shading.pixel_maps import taken
 from rtgs.methods.shading.straight import FirstBounce, GlassRays, Transmission
 from rtgs.optics.light import beyond_the_sensor, decoded
 from rtgs.render.buffers import TraceBuffers, TraceOptions
@@ -159,9 +160,10 @@ class StraightRays:
             frame.camera, wanted, self.watched, probe, torch.zeros(3), self.settings.render, self.base.extent
         )
         buffers = SURFELS.rasterize(rows, rows.colors, request)
-        alpha = buffers.alpha.flatten().index_select(0, pixels)
-        depth = None if buffers.depth is None else buffers.depth.flatten().index_select(0, pixels) - rays.near * alpha
-        met = TraceBuffers(buffers.features.flatten(1).index_select(1, pixels).T, None, alpha, depth)
+        maps = (buffers.features, buffers.alpha, *(() if buffers.depth is None else (buffers.depth,)))
+        colors, alpha, *depths = taken([each.flatten(each.ndim - 2) for each in maps], pixels)
+        depth = depths[0] - rays.near * alpha if depths else None
+        met = TraceBuffers(colors.T, None, alpha, depth)
         if probe is None or buffers.weight_sum is None:
             return met, ()
         return met, (Observation(own.name, probe, buffers.weight_sum),)

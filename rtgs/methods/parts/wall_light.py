@@ -22,7 +22,7 @@ from rtgs.methods.parts.rough_walls import Scatter
 from rtgs.methods.shading.outline import Outline, covering
 from rtgs.methods.shading.straight import GlassPixels, GlassRays
 from rtgs.methods.shading.surface_maps import with_mesh
-from rtgs.optics.dielectric import passed, wall_reflectance
+from rtgs.methods.shading.wall_weights import GlassWall
 from rtgs.optics.settings import WallSettings
 from rtgs.train.parameters import ParameterGroup, Rate
 
@@ -184,12 +184,12 @@ class WallLight:
         self._opened = None
         self._open(opened)
 
-    def walls(self, camera: Camera, pixels: Tensor) -> Tensor | float:
-        """(P,) float32 of flattened pixels (P,): 1, or 0 where the object's first surface is an opening; 1: nothing is
-        open."""
+    def walls(self, camera: Camera, pixels: Tensor) -> Tensor | None:
+        """(P,) float32 of flattened pixels (P,): 1, or 0 where the object's first surface is an opening; None: nothing
+        is open."""
         assert self._opened is not None
         if not self._any:
-            return 1.0
+            return None
         triangle = self._guide.surfaces(camera).triangle.flatten()[pixels].long()
         return 1 - (self._opened[triangle.clamp_min(0)] & (triangle >= 0)).float()
 
@@ -235,37 +235,9 @@ class WallLight:
         wall = 1 - self._opened[triangle.clamp_min(0)].float()
         return Outline(rows, met.mean(1), found.cosine[own], met / met.sum(1, keepdim=True), wall)
 
-    def weights(
-        self,
-        reflection: Tensor,
-        cosine: Tensor,
-        rows: Tensor,
-        walls: Tensor | float,
-        outline: Outline | None = None,
-    ) -> tuple[Tensor, Tensor]:
-        """w_r and w_t of P traced pixels: R and T in ``rows``, elsewhere ``reflection`` (P,) or (3, P), and 0.
-
-        ``walls``: of these rows, as :meth:`walls` has them; R is 0 and T is 1 where there is none. ``outline``: some of
-        these rows, whose samples have more angles than ``cosine``. Without a tint T is 1 - R in the shape of
-        ``reflection``, with one it is (3, P).
-        """
-        none = torch.zeros_like(reflection) if self.tint is None else torch.zeros(3, reflection.shape[-1])
-        reflected = walls * wall_reflectance(cosine.index_select(0, rows), self.index)
-        weights = self._put(reflection, none, rows, reflected, walls)
-        if outline is None:
-            return weights
-        return self._put(*weights, outline.rows, *outline.reflected(self.index))
-
-    def _put(
-        self, reflection: Tensor, passing: Tensor, rows: Tensor, reflected: Tensor, walls: Tensor | float
-    ) -> tuple[Tensor, Tensor]:
-        """w_r and w_t with R = ``reflected`` and its T in ``rows``."""
-        full = reflected.expand(*reflection.shape[:-1], -1)
-        through = 1 - full
-        if self.tint is not None:
-            walls = walls[:, None] if isinstance(walls, Tensor) else walls
-            through = passed(reflected[:, None], walls, self.tint).T
-        return reflection.index_copy(-1, rows, full), passing.index_copy(-1, rows, through)
+    def shown(self, camera: Camera, pixels: Tensor, inside: Tensor, outline: Outline | None) -> GlassWall:
+        """What traced flattened ``pixels`` (P,) show of the walls; ``inside`` (P,) bool: those that show the object."""
+        return GlassWall(inside, self.walls(camera, pixels), self.index, self.tint, outline)
 
     def scatters(self, step: int | None) -> list[Scatter | None]:
         """The samples of rough walls that make a picture: that of a ``step`` of training, or as many as the settings

@@ -10,8 +10,8 @@ weight k' = 1 - a (1 - k), which takes the place of k:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -33,7 +33,7 @@ class Outline:
     weight: Tensor  # (E, S) of each sample among those that meet the object: sums to 1, 0 for the others
     wall: Tensor  # (E, S) 1: there is a wall; 0: an opening
 
-    @property
+    @cached_property
     def partly(self) -> Tensor:
         """(B,) int64 into the E pixels: those that show something beside the object."""
         return (self.share < 1).nonzero()[:, 0]
@@ -50,22 +50,22 @@ def covering(specular: Tensor, share: Tensor, cover: float) -> Tensor:
     return 1 - share * (1 - own)
 
 
-def with_beside(lights: Sequence[Light], specular: Tensor, outline: Outline, beside: Tensor) -> tuple[Light, ...]:
-    """The ``lights`` of P pixels and what is seen beside the object, with weights that sum to no more than before.
+def beside_share(specular: Tensor, outline: Outline) -> Tensor:
+    """(P,) q of P traced pixels, 0 where nothing is seen beside the object; ``specular`` (P,) is k', as
+    :func:`covering` has it."""
+    rows = outline.rows.index_select(0, outline.partly)
+    own = (1 - outline.share[outline.partly]) / specular.index_select(0, rows).clamp_min(SMALLEST)
+    return torch.zeros_like(specular).index_copy(0, rows, own.clamp_max(1))
+
+
+def beside_light(outline: Outline, share: Tensor, colors: Tensor) -> Light:
+    """What P traced pixels show beside the object.
 
     Args:
-        lights: with their weights on glass.
-        specular: (P,) k', as :func:`covering` has it.
-        outline: which pixels.
-        beside: (B, 3) encoded colours P of :attr:`Outline.partly`.
-
-    Returns:
-        The lights, and one more.
+        outline: which of them.
+        share: (P,) of :func:`beside_share`; what the others show is dimmed by it.
+        colors: (B, 3) encoded colours P of :attr:`Outline.partly`.
     """
-    partly = outline.partly
-    rows = outline.rows[partly]
-    own = (1 - outline.share[partly]) / specular.index_select(0, rows).clamp_min(SMALLEST)
-    share = torch.zeros_like(specular).index_copy(0, rows, own.clamp_max(1))
-    color = torch.zeros(3, len(specular), dtype=beside.dtype).index_copy(1, rows, beside.T)
-    dimmed = [replace(light, weight=light.weight * (1 - share)) for light in lights]
-    return (*dimmed, Light(NAME, COLOR_NAME, share, color))
+    rows = outline.rows.index_select(0, outline.partly)
+    planes = torch.zeros(3, len(share), dtype=colors.dtype).index_copy(1, rows, colors.T)
+    return Light(NAME, COLOR_NAME, share, planes)

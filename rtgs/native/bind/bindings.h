@@ -45,6 +45,7 @@ void bind_blend(nb::module_& m);
 void bind_traced_pixels(nb::module_& m);
 void bind_surface(nb::module_& m);
 void bind_wall(nb::module_& m);
+void bind_wall_weights(nb::module_& m);
 void bind_light(nb::module_& m);
 void bind_features(nb::module_& m);
 void bind_surfels(nb::module_& m);

@@ -9,6 +9,7 @@
 
 #include "bind/bindings.h"
 #include "image/image.h"
+#include "image/sensor.h"
 #include "common/isa.h"
 #include "common/threads.h"
 
@@ -127,10 +128,31 @@ std::pair<float, float> depth_percentiles(Floats depth, std::optional<Floats> al
   return {near, values[high]};
 }
 
+SensorPicture sensor_of(const Floats& image, const Floats& photo, float brightest, const Floats& out, int threads) {
+  const int64_t count = int64_t(image.size());
+  require("sensor", photo, "photo", count);
+  require("sensor", out, "what comes out", count);
+  return {count, image.data(), photo.data(), brightest, checked_threads(threads)};
+}
+
 }  // namespace
 
 void bind_image(nb::module_& m) {
   using nb::arg;
+  m.def("cut_light", [](Floats image, Floats photo, float brightest, Floats cut, int threads) {
+    const SensorPicture in = sensor_of(image, photo, brightest, cut, threads);
+    nb::gil_scoped_release release;
+    cut_light(in, cut.data());
+  }, arg("image"), arg("photo"), arg("brightest"), arg("cut"), arg("threads"),
+     "Fills cut with the image, no brighter than 1 where the photo is at least so bright; see rtgs/train/terms.py.");
+  m.def("cut_light_backward", [](Floats image, Floats photo, float brightest, Floats upstream, Floats gradient,
+                                 int threads) {
+    const SensorPicture in = sensor_of(image, photo, brightest, gradient, threads);
+    require("sensor", upstream, "upstream", in.count);
+    nb::gil_scoped_release release;
+    cut_light_backward(in, upstream.data(), gradient.data());
+  }, arg("image"), arg("photo"), arg("brightest"), arg("upstream"), arg("gradient"), arg("threads"),
+     "Fills the gradient by the image; there is none by what is cut off.");
   m.def("photometric_loss", &photometric_loss, arg("image"), arg("target"), arg("l1"), arg("dssim"), arg("with_dssim"),
         arg("gradient").none(), arg("dissimilarity").none(), arg("threads"),
         "Mean |image - target|, mean 1 - SSIM (0 unless wanted); fills the gradient of l1 * first + dssim * second.");

@@ -22,6 +22,7 @@ NB_MODULE(_core, m) {
   rtgs::bind_traced_pixels(m);
   rtgs::bind_surface(m);
   rtgs::bind_wall(m);
+  rtgs::bind_wall_weights(m);
   rtgs::bind_light(m);
   rtgs::bind_features(m);
   rtgs::bind_raster(m);

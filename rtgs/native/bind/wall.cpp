@@ -1,47 +1,15 @@
-#include <nanobind/stl/optional.h>
-#include <nanobind/stl/tuple.h>
+#include "bind/wall.h"
 
-#include <optional>
 #include <tuple>
 #include <vector>
 
-#include "bind/bindings.h"
 #include "common/isa.h"
 #include "common/threads.h"
-#include "image/wall.h"
 
 namespace rtgs {
 namespace {
 
-const char* const kWall = "wall";
-
-// `Sums` partial sums of each block of `count` rows, and in the end their totals.
-struct Blocks {
-  Blocks(int64_t count, int sums) : sums(sums), parts(size_t((count + kWallBlock - 1) / kWallBlock * sums)) {}
-  void total(float* out) const {
-    for (int k = 0; k < sums; ++k) {
-      double total = 0;
-      for (size_t part = size_t(k); part < parts.size(); part += size_t(sums)) total += parts[part];
-      out[k] = float(total);
-    }
-  }
-  int sums;
-  std::vector<float> parts;
-};
-
-using Maybe = std::optional<Floats>;
-using Tint = std::tuple<float, float, float>;
-using GlassNumbers = std::tuple<float, std::optional<Tint>>;          // index, tint
 using LegArrays = std::tuple<Floats, Floats, Floats, Maybe, Floats>;  // contents, alpha, surroundings, later, cosine
-
-float* pointer(const Maybe& array) { return array ? array->data() : nullptr; }
-
-Glass glass_of(const GlassNumbers& numbers) {
-  const auto& [index, tint] = numbers;
-  if (!tint) return {index, false, {1, 1, 1}};
-  const auto [red, green, blue] = *tint;
-  return {index, true, {red, green, blue}};
-}
 
 WallLegGradients checked_leg(const LegArrays& arrays, int64_t count) {
   const auto& [contents, alpha, surroundings, later, cosine] = arrays;

@@ -1,5 +1,6 @@
 // Thin walls of glass: what they reflect, the light that comes to one of them along a path inside the object, and what
-// is seen through the far one. Twins: rtgs/optics/dielectric.py, rtgs/methods/shading/inner.py, far_wall.py beside it.
+// is seen through the far one, and how much pixels show of all that. Twins: rtgs/optics/dielectric.py, and
+// rtgs/methods/shading/inner.py, far_wall.py and wall_weights.py beside it.
 #pragma once
 #include <cstdint>
 
@@ -47,6 +48,27 @@ struct FarWallGradients {  // alpha: null without it; glass: (blocks, kGlassNumb
   float *alpha, *behind, *arriving, *cosine, *glass;
 };
 
+constexpr int kNoGlass = -2;
+struct WallPixels {  // P traced pixels
+  int64_t count;
+  const float *reflection, *cosine;  // (P) w_r where there is no glass, n . omega_o
+  const float* walls;                // (P) 1: there is a wall, 0: an opening; null: 1
+  const int32_t* place;              // (whole registers of P) a pixel's row at the outline; -1: glass elsewhere; kNoGlass
+  // (P) k_s, and of rows at the outline R, the share that meets a wall, and a; null: no pixel is there
+  const float *specular, *edge_reflected, *edge_wall, *edge_share;
+  Glass glass;
+  int threads;
+};
+struct WallPixelWeights {  // (P) w_r, (P) or with a tint (3, P) w_t, (P) of what is beside or null: nothing is
+  float *reflection, *passing, *beside;
+};
+struct WallPixelUpstream {  // the same
+  const float *reflection, *passing, *beside;
+};
+struct WallPixelGradients {  // specular and edge_reflected: null without an outline; glass: as above
+  float *reflection, *cosine, *specular, *edge_reflected, *glass;
+};
+
 #define RTGS_DECLARE_WALL_KERNELS(isa)                                                                    \
   namespace isa {                                                                                         \
   void wall_reflectance(const WallAngles&, float* reflected);                                             \
@@ -55,6 +77,8 @@ struct FarWallGradients {  // alpha: null without it; glass: (blocks, kGlassNumb
   void wall_leg_backward(const WallLeg&, const float* upstream, const WallLegGradients&);                 \
   void far_wall(const FarWall&, float* color);                                                            \
   void far_wall_backward(const FarWall&, const float* upstream, const FarWallGradients&);                 \
+  void wall_weights(const WallPixels&, const WallPixelWeights&);                                          \
+  void wall_weights_backward(const WallPixels&, const WallPixelUpstream&, const WallPixelGradients&);     \
   }  // index: (blocks) partial sums; color, upstream: (3, R)
 RTGS_DECLARE_WALL_KERNELS(portable)
 #if defined(__x86_64__)
