@@ -7,6 +7,7 @@ and at which angles it is met: reflectance rises steeply towards the outline, an
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -25,7 +26,7 @@ class Coverage:
     cosine: Tensor  # (K, S) float32 of the angle of incidence there; 1 where it misses
     beside: ObjectRows  # of those pixels whose centre misses it: the sample nearest to the middle of what meets it
 
-    @property
+    @cached_property
     def share(self) -> Tensor:
         """(K,) of the pixel that shows the object, above 0."""
         return (self.triangle >= 0).float().mean(1)

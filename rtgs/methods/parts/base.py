@@ -167,9 +167,10 @@ class BaseSet(Part):
             self._bent(frame, rows, more) if wanted.normal else None,
         )
         buffers = self.kind.rasterize(shape, features, request)
+        own = rows if self.set.smoothing is None else None
         if probe is None or buffers.weight_sum is None:
-            return Raster(buffers)
-        return Raster(buffers, (Observation(self.name, probe, buffers.weight_sum[: len(self.set)]),))
+            return Raster(buffers, shape=own)
+        return Raster(buffers, (Observation(self.name, probe, buffers.weight_sum[: len(self.set)]),), own)
 
     @torch.no_grad()
     def weight_of(self, chosen: Tensor, camera: Camera, step: int) -> tuple[Tensor, Tensor]:

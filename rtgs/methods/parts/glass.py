@@ -14,7 +14,7 @@ from rtgs.core.cameras import Camera
 from rtgs.core.decisions import Decision
 from rtgs.core.errors import RtgsError
 from rtgs.gaussians.materials import material_channels
-from rtgs.gaussians.surfels import Surfels
+from rtgs.gaussians.surfels import ActivatedGaussians, Surfels
 from rtgs.mesh.container import ObjectGuide, ObjectMesh
 from rtgs.mesh.silhouettes import bounding
 from rtgs.mesh.spread import ObjectSurfaces
@@ -230,7 +230,7 @@ class Glass(Part):
             self.wall.set_for(frame.step if frame.training and frame.step < self.plan.judged else None)
         scatters = [None] if self.wall is None else self.wall.scatters(frame.step if frame.training else None)
         outline = None if self.wall is None else self.wall.outline(frame.camera, chosen.index, glass)
-        shown = GlassView(frame, chosen, glass, straight, outline, bend)
+        shown = GlassView(frame, raster.shape, chosen, glass, straight, outline, bend)
         aside = None if outline is None else rays.rows(chosen.index[outline.rows[outline.partly]])
         samples = [self._sample(shown, each, None if number else aside) for number, each in enumerate(scatters)]
         (met, passed, weights, _), lights = samples[0], mean_of_lights([lights for *_, lights in samples])
@@ -258,7 +258,7 @@ class Glass(Part):
         weights = self.weights(met, inside, frame.camera, chosen.index, shown.outline)
         near, onward = (rays, None) if bent is None else (bent.near, bent.far)
         wall = None if self.wall is None else FarWall(inner, met.others, self.wall.index, self.wall.tint)
-        passed = self._straight(frame).transmit(frame, near, pixels, wall, onward, aside)
+        passed = self._straight(frame, shown.shape).transmit(frame, near, pixels, wall, onward, aside)
         through = Light("transmission", "transmitted_color", weights.transmission, passed.color, passed.parts)
         own, *coats = self.mirror.lights(met, weights.reflection, inside)
         return met, passed, weights, (own, through, *coats)
@@ -282,6 +282,8 @@ class Glass(Part):
 
     def on_glass(self, surfaces: ObjectSurfaces) -> Tensor:
         """(H, W) bool: the mesh's first surface is one of the object's, not a lid or a label."""
+        if bool(self._glass.all()):
+            return surfaces.hit
         return surfaces.hit & self._glass[surfaces.triangle.clamp_min(0).long()]
 
     def weights(
@@ -300,7 +302,7 @@ class Glass(Part):
         found = glass_weights(reflection, cosine, met.pixels, inside, optics, largest, settings.weight_bound)
         return WallWeights(*found, beside=None)
 
-    def _straight(self, frame: Frame) -> StraightRays:
+    def _straight(self, frame: Frame, shape: ActivatedGaussians | None) -> StraightRays:
         assert self.guide is not None
         own = self.transmittance
         return StraightRays(
@@ -308,6 +310,7 @@ class Glass(Part):
             self.guide.mesh,
             self.base,
             self._base_tree,
+            shape,
             own,
             0 if own is None else self._own_degree(frame.step),
             frame.training and self._depth_loss_on(frame.step),

@@ -99,6 +99,7 @@ class Raster:
 
     buffers: RasterBuffers
     observations: tuple[Observation, ...] = ()
+    shape: ActivatedGaussians | None = None  # of the base set's own rows, without what filters add; None: not kept
 
 
 Look = Callable[["View", RenderOptions], RenderedView]

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from rtgs.gaussians.surfels import ActivatedGaussians
 from rtgs.methods.parts.part import Frame
 from rtgs.methods.shading.bent import Bend
 from rtgs.methods.shading.mirror import MirrorRays, SurfacePixels
@@ -112,6 +113,7 @@ class GlassView:
     """What of a view with glass is traced."""
 
     frame: Frame
+    shape: ActivatedGaussians | None  # of the base set, as it was rasterised
     chosen: TracedPixels
     glass: GlassPixels
     rays: GlassRays  # straight ones, behind the near wall

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from rtgs.gaussians.surfels import Surfels
+from rtgs.gaussians.surfels import ActivatedGaussians, Surfels
 from rtgs.mesh.container import ObjectMesh
 from rtgs.methods.parts.base import BaseSet
 from rtgs.methods.parts.kinds import SURFELS, RasterRequest
@@ -59,6 +59,7 @@ class StraightRays:
     Attributes:
         own: the transmittance set, ``own_degree`` of its SH in use; None: rays meet the base set inside the object.
         base_tree: of the base set as it is traced; the interface is not in it.
+        base_shape: its geometry as it was rasterised; None: it has to be activated.
         measured: the loss on the first bounce's depth is on.
         watched: density control of the transmittance set learns from this view.
         uncut: what lies behind a wall is shown with the light that photos of it cut off. Not where photos taken through
@@ -69,6 +70,7 @@ class StraightRays:
     mesh: ObjectMesh
     base: BaseSet
     base_tree: FollowingTree
+    base_shape: ActivatedGaussians | None
     own: TracedSet | None
     own_degree: int
     measured: bool
@@ -257,4 +259,4 @@ class StraightRays:
         """Through the base set: its SH colours alone, no reflection in it; the interface is not met."""
         gaussians = self.base.set.gaussians
         assert isinstance(gaussians, Surfels)
-        return trace_set(gaussians, self.base_tree, origins, directions, options)
+        return trace_set(gaussians, self.base_tree, origins, directions, options, active=self.base_shape)

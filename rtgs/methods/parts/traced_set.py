@@ -10,7 +10,7 @@ from torch import Tensor
 from rtgs.gaussians.activate import activate_geometry
 from rtgs.gaussians.density import DensityReport
 from rtgs.gaussians.settings import DensitySettings, OptimizerSettings
-from rtgs.gaussians.surfels import Surfels
+from rtgs.gaussians.surfels import ActivatedGaussians, Surfels
 from rtgs.methods.parts.gaussian_set import GaussianSet
 from rtgs.render.buffers import TraceBuffers, TraceOptions
 from rtgs.render.trace import SurfelTree, trace_surfels
@@ -56,9 +56,13 @@ def trace_set(
     directions: Tensor,
     options: TraceOptions,
     probe: Tensor | None = None,
+    active: ActivatedGaussians | None = None,
 ) -> TraceBuffers:
-    """What rays (R, 3) from ``origins`` along ``directions`` meet of raw ``surfels``: SH colours, and what is asked."""
-    active = activate_geometry(surfels)
+    """What rays (R, 3) from ``origins`` along ``directions`` meet of raw ``surfels``: SH colours, and what is asked.
+
+    ``active``: their geometry, where it is known already.
+    """
+    active = active or activate_geometry(surfels)
     shape = (active.means, active.tangent_u, active.tangent_v, active.scales, active.opacities)
     return trace_surfels(
         *shape,

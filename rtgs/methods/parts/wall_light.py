@@ -233,7 +233,7 @@ class WallLight:
         triangle = found.triangle[own].long()
         met = (triangle >= 0).float()
         wall = 1 - self._opened[triangle.clamp_min(0)].float()
-        return Outline(rows, met.mean(1), found.cosine[own], met / met.sum(1, keepdim=True), wall)
+        return Outline(rows, found.share[own], found.cosine[own], met / met.sum(1, keepdim=True), wall)
 
     def shown(self, camera: Camera, pixels: Tensor, inside: Tensor, outline: Outline | None) -> GlassWall:
         """What traced flattened ``pixels`` (P,) show of the walls; ``inside`` (P,) bool: those that show the object."""
