@@ -206,6 +206,8 @@ class Model:
 
     def losses(self, rendered: RenderedView, view: View, step: int) -> LossValues:
         """L1 and D-SSIM always, the other terms while they act (method.md 5)."""
+        for part in self.parts.values():
+            part.saw(rendered, view)
         return self.loss.evaluate(rendered, view, step)
 
     def after_step(self, step: int, observations: tuple[Observation, ...]) -> tuple[StepEvent, ...]:

@@ -228,6 +228,9 @@ class TransmittanceSettings:
     # Surfaces beside the object mirror in this stage, too. Where none does, False saves a seventh of the time;
     # with first_bounce "none" it says nothing.
     mirrors_beside: bool = field(default=True, metadata=UNLESS_DEFAULT)
+    # Share of the object's pixels that a training step traces, about: tiles that were wrong when the view was last seen
+    # are drawn more often, and count by the inverse (docs/lab/glass_light.md). 1: all.
+    drawn_share: float = field(default=1.0, metadata=UNLESS_DEFAULT)
     # Decision 26: what it meets; "base": the base set inside; "none": nothing.
     first_bounce: Literal["transmittance", "base", "none"] = "transmittance"
     # Decision 17: the paper relies on L_d; "clip": no hit counts behind the back surface.
@@ -307,8 +310,9 @@ class TransmittanceSettings:
         given = [name for name in ("max_gain", "base_too_large") if getattr(self, name) is not None]
         refuse_outside(self, "method.transmittance", 0, math.inf, *given)
         refuse_outside(self, "method.transmittance", 0, 1, "opaque_share", "opaque", "alpha_cutoff")
-        key = "method.transmittance.start_opacity"
-        refuse_unless(0 < self.start_opacity <= 1, key, self.start_opacity, "above 0 and at most 1")
+        for name in ("start_opacity", "drawn_share"):
+            value = getattr(self, name)
+            refuse_unless(0 < value <= 1, f"method.transmittance.{name}", value, "above 0 and at most 1")
         for name in ("start", "half_size_until", "densify_until"):
             value = getattr(self, name)
             refuse_unless(0 <= value <= 1, f"method.transmittance.{name}", value, "between 0 and 1")

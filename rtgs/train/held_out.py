@@ -12,7 +12,7 @@ from rtgs.scenes.scene import Scene
 from rtgs.train.method import Mode
 
 if TYPE_CHECKING:
-    from rtgs.train.method import Method
+    from rtgs.train.method import Drawn, Method
 
 LOOKS = 8  # in a whole run
 LEAST_STEPS = 20  # between two of them: a look is a render, a third of a step
@@ -45,9 +45,12 @@ class HeldOutView:
         return psnr_of(image, self._view.image)
 
 
-def psnr_of(image: Tensor, target: Tensor) -> float:
-    """PSNR in dB of an image clamped to [0, 1]."""
-    return decibels(float((image.clamp(0, 1) - target).square_().mean()))
+def psnr_of(image: Tensor, target: Tensor, drawn: Drawn | None = None) -> float:
+    """PSNR in dB of an image (3, H, W) clamped to [0, 1]; of pixels that were ``drawn`` by their weights."""
+    squares = (image.clamp(0, 1) - target).square_()
+    return decibels(
+        float(squares.mean() if drawn is None else (squares * drawn.weight).sum() / (3 * drawn.weight.sum()))
+    )
 
 
 def decibels(mse: float) -> float:

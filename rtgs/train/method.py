@@ -68,6 +68,18 @@ class Observation:
 
 
 @dataclass(frozen=True)
+class Drawn:
+    """What a training step looks at, where it does not look at all of a view."""
+
+    weight: Tensor  # (H, W) 1 / the probability with which a pixel is drawn; 0: this time it is not
+
+    @property
+    def pixels(self) -> Tensor:
+        """(H, W) bool: those that are drawn. What the image shows in others means nothing."""
+        return self.weight > 0
+
+
+@dataclass(frozen=True)
 class RenderedView:
     """What a method shows from one camera.
 
@@ -91,6 +103,7 @@ class RenderedView:
     maps: Mapping[str, Tensor] = field(default_factory=dict)
     kept: object = None  # what the part that shaded keeps for loss terms of its own; None: nothing
     observations: tuple[Observation, ...] = ()  # in training, of the sets whose density control will run again
+    drawn: Drawn | None = None  # in training; None: every pixel
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from rtgs.native import core
 from rtgs.native.arrays import arrays_of
 from rtgs.native.threads import threads
 from rtgs.train.losses import photometric_loss
-from rtgs.train.method import LossValue, LossValues, RenderedView, RenderOptions
+from rtgs.train.method import Drawn, LossValue, LossValues, RenderedView, RenderOptions
 from rtgs.train.schedule import loss_start
 
 if TYPE_CHECKING:
@@ -96,6 +96,8 @@ class LossTable:
         """The weighted sum of what acts at ``step``."""
         if self.clipped:
             rendered = replace(rendered, image=as_the_sensor(rendered.image, view.image))
+        if rendered.drawn is not None:
+            rendered = replace(rendered, image=as_drawn(rendered.image, view.image, rendered.drawn))
         photometric = photometric_loss(rendered.image, view.image, self.l1, self.dssim)
         first = (LossValue("l1", photometric.l1, self.l1), LossValue("dssim", photometric.dssim, self.dssim))
         found = LossValues(photometric.total, first)
@@ -137,6 +139,24 @@ class _AsTheSensor(torch.autograd.Function):
         given = (*arrays_of(*ctx.saved_tensors), BRIGHTEST, *arrays_of(upstream, gradient))
         core.cut_light_backward(*given, threads())
         return gradient, None
+
+
+def as_drawn(image: Tensor, photo: Tensor, drawn: Drawn) -> Tensor:
+    """(3, H, W) the image, and the photo in pixels that were not drawn: there is no error and no gradient. What the
+    others teach counts by their weight, so that on average nothing is missing."""
+    return _AsDrawn.apply(image, photo, drawn)  # type: ignore[return-value]
+
+
+class _AsDrawn(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, image: Tensor, photo: Tensor, drawn: Drawn) -> Tensor:
+        ctx.weight = drawn.weight
+        return torch.where(drawn.pixels, image, photo)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, upstream: Tensor):  # type: ignore[override]
+        return upstream * ctx.weight, None, None
 
 
 def table_of(settings: LossSettings, terms: Iterable[LossTerm]) -> LossTable:

@@ -241,7 +241,7 @@ class Trainer:
         self._note(step + 1, events)
         self._averages.add_loss(loss)
         if step % REPORT_EVERY == 0:
-            self._averages.add_psnr(psnr_of(rendered.image.detach(), view.image))
+            self._averages.add_psnr(psnr_of(rendered.image.detach(), view.image, rendered.drawn))
         self._window.append(terms.terms)
         self._step = step + 1
 

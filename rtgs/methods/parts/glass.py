@@ -19,6 +19,7 @@ from rtgs.mesh.container import ObjectGuide, ObjectMesh
 from rtgs.mesh.silhouettes import bounding
 from rtgs.mesh.spread import ObjectSurfaces
 from rtgs.methods.parts.base import BaseSet, composited
+from rtgs.methods.parts.drawn_tiles import DrawnTiles
 from rtgs.methods.parts.gaussian_set import GaussianSet, densified, opacity_reset
 from rtgs.methods.parts.glass_evidence import glass_faces, kept_in_base, left_out, reason_against
 from rtgs.methods.parts.glass_pixels import object_pixels, views_without_glass
@@ -72,6 +73,7 @@ class Glass(Part):
         wall: how its walls reflect; None: by learned weights.
         vertices: of its mesh, where they are learned; None: they stay.
         begun: the stage has begun.
+        tiles: which of the object's a step of training traces.
     """
 
     name = "glass"
@@ -91,6 +93,7 @@ class Glass(Part):
         self.wall: WallLight | None = None
         self.vertices: LearnedVertices | None = None
         self.begun = False
+        self.tiles = DrawnTiles(settings.transmittance.drawn_share, setup.scene.train, setup.generator)
         self._stage = stage
         self._from_base = False  # the transmittance set was taken from the base set
         self._glass = torch.zeros(0, dtype=torch.bool)  # (F,) faces of the mesh that are the object's surface
@@ -223,8 +226,9 @@ class Glass(Part):
         flat = mirror.surface(raster.buffers)
         bend = None if self.vertices is None else self.vertices.bend(frame.step)
         glass = self.pixels(frame, flat, bend)
+        drawn = self.tiles.draw(frame.camera, glass.inside) if frame.training else None
         beside = self.settings.transmittance.mirrors_beside
-        chosen = mirror.choose(frame, raster.buffers, glass.flat, always=glass.inside, others=beside)
+        chosen = mirror.choose(frame, raster.buffers, glass.flat, always=glass.inside, others=beside, drawn=drawn)
         straight = glass_rays(glass, chosen.index, rays.center, rays.rows)
         if self.wall is not None:
             self.wall.set_for(frame.step if frame.training and frame.step < self.plan.judged else None)
@@ -238,8 +242,11 @@ class Glass(Part):
             lights = (*lights, beside_light(outline, weights.beside, passed.beside))
         maps = {"transparent": glass.inside.reshape(shape), "specular": flat.specular.reshape(shape)}
         seen = (*met.observations, *passed.observations)
-        traced = Traced(glass.flat, chosen, met.pixels, lights, maps, passed.first_bounce, seen)
-        return lit_view(frame, raster, traced, self.settings.optics)
+        bounce = passed.first_bounce
+        if bounce is not None and drawn is not None:
+            bounce = replace(bounce, weight=drawn.weight.flatten()[chosen.index[straight.rows[straight.second]]])
+        traced = Traced(glass.flat, chosen, met.pixels, lights, maps, bounce, seen)
+        return replace(lit_view(frame, raster, traced, self.settings.optics), drawn=drawn)
 
     def _sample(
         self, shown: GlassView, scatter: Scatter | None, aside: Tensor | None
@@ -336,6 +343,9 @@ class Glass(Part):
 
     # ---- between steps
 
+    def saw(self, rendered: RenderedView, view: View) -> None:
+        self.tiles.saw(rendered, view)
+
     def step(self, step: int, observations: Mapping[str, Observation]) -> None:
         """Adam on the sets of this stage; the transmittance set on its own clock."""
         self._base_tree.moved()
@@ -385,7 +395,7 @@ class Glass(Part):
         walls = {} if self.wall is None else self.wall.state()
         vertices = {} if self.vertices is None else self.vertices.state()
         begun = torch.tensor([self._from_base], dtype=torch.uint8)
-        return {_BEGUN: begun, _GLASS: self._glass.to(torch.uint8), **walls, **vertices}
+        return {_BEGUN: begun, _GLASS: self._glass.to(torch.uint8), **walls, **vertices, **self.tiles.state()}
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
         """The stage as far as the state has it."""
@@ -395,6 +405,7 @@ class Glass(Part):
         if self.begun:
             tuple(self._put_vertices(lambda _: torch.zeros(0, dtype=torch.uint8)))  # its own are in the state
             self._put_walls()
+            self.tiles.restore(state)
             if self.wall is not None:
                 self.wall.restore(state)
             if self.vertices is not None:

@@ -51,7 +51,7 @@ from rtgs.methods.shading.pixel_maps import shown_colors, take_pixels
 from rtgs.methods.shading.surface_maps import seen_surface
 from rtgs.methods.shading.traced_pixels import TracedPixels, choose_pixels
 from rtgs.render.buffers import RasterBuffers, TraceOptions
-from rtgs.train.method import Mode, Observation, RenderedView, RenderOptions, Stage, StepEvent
+from rtgs.train.method import Drawn, Mode, Observation, RenderedView, RenderOptions, Stage, StepEvent
 from rtgs.train.parameters import ParameterGroup
 from rtgs.train.schedule import densify_ahead, densify_due, opacity_was_reset, sh_degree_at
 from rtgs.train.settings import ScheduleSettings
@@ -206,14 +206,16 @@ class Mirror(Part):
         *,
         always: Tensor | None = None,
         others: bool = True,
+        drawn: Drawn | None = None,
     ) -> TracedPixels:
         """Which pixels are traced, which of them share a ray; ``always`` (H * W,) bool: each by a ray of its own, and
-        without ``others`` none but these."""
+        without ``others`` none but these; of all of them those that are ``drawn``."""
         settings, traced = self.settings.reflection, self.settings.reflection.traced
         if not frame.training or frame.step < self.plan.judged:  # k_s has to tell the mirrors from the rest first
             traced = replace(traced, shared_below=0.0)
         there = surface_there(flat, buffers.alpha.flatten(), settings.smallest_alpha)
         there = there if others or always is None else there & always
+        there = there if drawn is None else there & drawn.pixels.flatten()
         showing = None
         if traced.threshold > 0 or traced.shared_below > 0:
             showing = showing_reflection(flat, lambda: frame.rays.directions, self.settings.optics)

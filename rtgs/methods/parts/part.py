@@ -154,6 +154,9 @@ class Part:
         """The view that some part shaded, changed: what happens in the camera, for example."""
         return shaded
 
+    def saw(self, rendered: RenderedView, view: View) -> None:
+        """A training view as it came out, before the backward pass."""
+
     def step(self, step: int, observations: Mapping[str, Observation]) -> None:
         """Adam on the sets after the backward pass; ``observations`` of the view by the name of the set. The model
         steps the groups."""

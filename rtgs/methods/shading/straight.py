@@ -56,6 +56,7 @@ class FirstBounce:
     alpha: Tensor  # (R,) A_1, with its graph
     thickness: Tensor  # (R,) z_2 - z_s, no graph
     beyond: Tensor | None = None  # (R,) sum of w (t - thickness) over the hits behind the back surface, if asked for
+    weight: Tensor | None = None  # (R,) with which a ray counts; None: 1
 
 
 @dataclass(frozen=True)
@@ -154,9 +155,11 @@ def depth_loss(bounce: FirstBounce, form: str, pixels: int) -> Tensor:
     """
     if form == "per_hit":
         assert bounce.beyond is not None
-        return bounce.beyond.clamp_min(0).sum() / pixels
-    depth = bounce.depth / bounce.alpha.clamp_min(1e-3) if form == "mean" else bounce.depth
-    return (depth - bounce.thickness).clamp_min(0).sum() / pixels
+        late = bounce.beyond
+    else:
+        late = (bounce.depth / bounce.alpha.clamp_min(1e-3) if form == "mean" else bounce.depth) - bounce.thickness
+    late = late.clamp_min(0)
+    return (late if bounce.weight is None else bounce.weight * late).sum() / pixels
 
 
 def mesh_normal_loss(normal: Tensor, target: Tensor, where: Tensor) -> Tensor:
