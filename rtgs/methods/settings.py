@@ -229,7 +229,8 @@ class TransmittanceSettings:
     # with first_bounce "none" it says nothing.
     mirrors_beside: bool = field(default=True, metadata=UNLESS_DEFAULT)
     # Share of the object's pixels that a training step traces, about: tiles that were wrong when the view was last seen
-    # are drawn more often, and count by the inverse (docs/lab/glass_light.md). 1: all.
+    # are drawn more often, and count by the inverse (docs/lab/glass_light.md). The log's losses are those of what was
+    # drawn. No tile is drawn more seldom than in a quarter of the steps. 1: all, as always with first_bounce "none".
     drawn_share: float = field(default=1.0, metadata=UNLESS_DEFAULT)
     # Decision 26: what it meets; "base": the base set inside; "none": nothing.
     first_bounce: Literal["transmittance", "base", "none"] = "transmittance"
@@ -310,9 +311,10 @@ class TransmittanceSettings:
         given = [name for name in ("max_gain", "base_too_large") if getattr(self, name) is not None]
         refuse_outside(self, "method.transmittance", 0, math.inf, *given)
         refuse_outside(self, "method.transmittance", 0, 1, "opaque_share", "opaque", "alpha_cutoff")
-        for name in ("start_opacity", "drawn_share"):
-            value = getattr(self, name)
-            refuse_unless(0 < value <= 1, f"method.transmittance.{name}", value, "above 0 and at most 1")
+        key = "method.transmittance.start_opacity"
+        refuse_unless(0 < self.start_opacity <= 1, key, self.start_opacity, "above 0 and at most 1")
+        key = "method.transmittance.drawn_share"
+        refuse_unless(0.25 <= self.drawn_share <= 1, key, self.drawn_share, "at least 0.25 and at most 1 (1: all)")
         for name in ("start", "half_size_until", "densify_until"):
             value = getattr(self, name)
             refuse_unless(0 <= value <= 1, f"method.transmittance.{name}", value, "between 0 and 1")

@@ -46,7 +46,8 @@ class HeldOutView:
 
 
 def psnr_of(image: Tensor, target: Tensor, drawn: Drawn | None = None) -> float:
-    """PSNR in dB of an image (3, H, W) clamped to [0, 1]; of pixels that were ``drawn`` by their weights."""
+    """PSNR in dB of an image (3, H, W) clamped to [0, 1]; of pixels that were ``drawn``, at least one, by their
+    weights."""
     squares = (image.clamp(0, 1) - target).square_()
     return decibels(
         float(squares.mean() if drawn is None else (squares * drawn.weight).sum() / (3 * drawn.weight.sum()))

@@ -142,8 +142,8 @@ class _AsTheSensor(torch.autograd.Function):
 
 
 def as_drawn(image: Tensor, photo: Tensor, drawn: Drawn) -> Tensor:
-    """(3, H, W) the image, and the photo in pixels that were not drawn: there is no error and no gradient. What the
-    others teach counts by their weight, so that on average nothing is missing."""
+    """(3, H, W) the image, and the photo in pixels that were not drawn: there is no error and no gradient. The gradient
+    of the others counts by their weight; values do not, so that a loss is that of what was drawn."""
     return _AsDrawn.apply(image, photo, drawn)  # type: ignore[return-value]
 
 

@@ -240,7 +240,7 @@ class Trainer:
             raise diverged(terms, self.method, step, view.name, cause=str(error)) from error
         self._note(step + 1, events)
         self._averages.add_loss(loss)
-        if step % REPORT_EVERY == 0:
+        if step % REPORT_EVERY == 0 and (rendered.drawn is None or bool(rendered.drawn.pixels.any())):
             self._averages.add_psnr(psnr_of(rendered.image.detach(), view.image, rendered.drawn))
         self._window.append(terms.terms)
         self._step = step + 1

@@ -97,8 +97,7 @@ def test_the_papers_glass_has_the_weights_the_mesh_and_the_box_of_the_paper():
     config, found = composed("method=rtgs", "preset=quick", "ablation=paper_glass")
     _, printed = composed("method=rtgs_printed", "preset=quick")
     # Of schedule and rounding; of walls by physics alone.
-    left = {"freeze_base", "half_size_until", "drawn_share", "offset"}
-    left |= {"rim_samples", "wall.clipped_light", "wall.openings"}
+    left = {"freeze_base", "half_size_until", "offset", "rim_samples", "wall.clipped_light", "wall.openings"}
     keys = [key for key in found if key.startswith(("method.transmittance.", "mesh.source", "method.optics.max_gain"))]
     differing = {key for key in keys if found[key] != printed[key]}
     assert {key.removeprefix("method.transmittance.") for key in differing} == left

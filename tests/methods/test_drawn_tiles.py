@@ -135,6 +135,7 @@ def test_what_is_drawn_teaches_its_weight_of_what_it_teaches_in_a_whole_view(mad
     view = made.scene.train[0]
     method = seen(made, drawing(**changes), view)
     leaves = [each for part in method.sets for _, each in part.gaussians.items() if each.requires_grad]
+    leaves += [each for group in method.groups for _, each in group.tensors()]
     upstream = torch.randn(view.image.shape, generator=torch.Generator().manual_seed(1))
 
     def gradients(image: Tensor, upstream: Tensor) -> list[Tensor]:
@@ -191,6 +192,28 @@ def test_errors_are_those_of_the_glass_in_the_tiles_that_were_drawn(made: GlassS
     assert checked > 1
 
 
+def test_first_bounces_have_the_weights_of_their_pixels(made: GlassScene, monkeypatch: pytest.MonkeyPatch):
+    view, step = made.scene.train[0], 50  # the loss on their depths acts
+    method = begun(drawing(), made)
+    method.losses(method.render(view.camera, step, Mode.TRAIN, mask=view.mask), view, step)
+    glass, mirror = method.parts["glass"], method.parts["mirror"]
+    assert isinstance(glass, Glass)
+    assert isinstance(mirror, Mirror)
+    chosen, shown = [], []
+    choose, pixels = mirror.choose, glass.pixels
+    monkeypatch.setattr(mirror, "choose", lambda *given, **more: chosen.append(choose(*given, **more)) or chosen[-1])
+    monkeypatch.setattr(glass, "pixels", lambda *given: shown.append(pixels(*given)) or shown[-1])
+    rendered = method.render(view.camera, step, Mode.TRAIN, mask=view.mask)
+    assert rendered.drawn is not None
+    assert isinstance(rendered.kept, FirstBounce)
+    index = chosen[0].index
+    through = index[(shown[0].inside & shown[0].second)[index]]
+    expected = rendered.drawn.weight.flatten()[through]
+    assert rendered.kept.weight is not None
+    assert torch.equal(rendered.kept.weight, expected)
+    assert len(expected.unique()) > 1
+
+
 @pytest.mark.parametrize("form", ["accum", "mean"])
 def test_depths_of_rays_count_by_their_weight(form: str):
     depth, alpha, thickness = torch.tensor([1.0, 0.2, 0.9]), torch.ones(3), torch.tensor([0.5, 0.5, 0.5])
@@ -229,6 +252,7 @@ def test_training_goes_on_bit_for_bit(made: GlassScene, settings: MethodSettings
 
 def test_a_share_of_nothing_is_refused():
     base = fresnel().transmittance
-    for share in (0.0, 1.5):
+    for share in (0.0, LEAST - 0.01, 1.5):
         with pytest.raises(RtgsError, match=r"method\.transmittance\.drawn_share"):
             replace(base, drawn_share=share)
+    assert replace(base, drawn_share=LEAST).drawn_share == LEAST

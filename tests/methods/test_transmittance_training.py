@@ -75,8 +75,10 @@ def _events_of(method, step: int):
     return method.after_step(step, ())
 
 
-def test_a_killed_stage_goes_on_bit_for_bit(made: GlassScene, tmp_path: Path):
+@pytest.mark.parametrize("share", [1.0, 0.5])
+def test_a_killed_stage_goes_on_bit_for_bit(made: GlassScene, tmp_path: Path, share: float):
     settings = held(5.0)
+    settings = replace(settings, transmittance=replace(settings.transmittance, drawn_share=share))
     whole = new_glass_method(settings, made)
     train_stages(whole, made.scene, folder=tmp_path / "whole")
     halves = new_glass_method(settings, made)

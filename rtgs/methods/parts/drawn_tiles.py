@@ -1,7 +1,8 @@
 """Which tiles of a transparent object a step of training traces: wrong ones more often (docs/transmittance.md).
 
-A tile is drawn with a probability in proportion to its error when the view was last seen, and what it teaches counts by
-the inverse: on average a step teaches what all pixels together would.
+A tile is drawn with a probability in proportion to its error when the view was last seen, and its gradient counts by
+the inverse: what each pixel teaches is right on average. Losses whose windows reach into tiles that were not drawn,
+D-SSIM and L_perc, see the photo there.
 """
 
 from __future__ import annotations

@@ -93,7 +93,8 @@ class Glass(Part):
         self.wall: WallLight | None = None
         self.vertices: LearnedVertices | None = None
         self.begun = False
-        self.tiles = DrawnTiles(settings.transmittance.drawn_share, setup.scene.train, setup.generator)
+        seen = (*setup.scene.train, *setup.scene.held)
+        self.tiles = DrawnTiles(settings.transmittance.drawn_share, seen, setup.generator)
         self._stage = stage
         self._from_base = False  # the transmittance set was taken from the base set
         self._glass = torch.zeros(0, dtype=torch.bool)  # (F,) faces of the mesh that are the object's surface
@@ -402,10 +403,10 @@ class Glass(Part):
         self.begun = _BEGUN in state
         self._from_base = self.begun and bool(state[_BEGUN])
         self._glass = state[_GLASS].bool() if self.begun else self._glass
+        self.tiles.restore(state)
         if self.begun:
             tuple(self._put_vertices(lambda _: torch.zeros(0, dtype=torch.uint8)))  # its own are in the state
             self._put_walls()
-            self.tiles.restore(state)
             if self.wall is not None:
                 self.wall.restore(state)
             if self.vertices is not None:
