@@ -30,11 +30,7 @@ from rtgs.train.seeds import generator_for
 from rtgs.train.trainer import Trainer
 
 VOXELS = 96  # along the object's longest side, as the hull's
-EVERY_PIXEL = (
-    "method.reflection.traced.shared_below=0",
-    "method.reflection.traced.threshold=0",
-    "method.transmittance.drawn_share=1",
-)
+EVERY_PIXEL = ("method.reflection.traced.shared_below=0", "method.reflection.traced.threshold=0")
 
 
 def true_mesh(scene: str) -> ObjectMesh:

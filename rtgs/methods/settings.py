@@ -230,7 +230,7 @@ class TransmittanceSettings:
     mirrors_beside: bool = field(default=True, metadata=UNLESS_DEFAULT)
     # Share of the object's pixels that a training step traces, about: tiles that were wrong when the view was last seen
     # are drawn more often, and count by the inverse (docs/lab/glass_light.md). The log's losses are those of what was
-    # drawn. No tile is drawn more seldom than in a quarter of the steps. 1: all, as always with first_bounce "none".
+    # drawn. No tile is drawn more seldom than in a quarter of the steps. 1: all, as without a first bounce.
     drawn_share: float = field(default=1.0, metadata=UNLESS_DEFAULT)
     # Decision 26: what it meets; "base": the base set inside; "none": nothing.
     first_bounce: Literal["transmittance", "base", "none"] = "transmittance"
