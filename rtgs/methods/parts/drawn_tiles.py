@@ -8,12 +8,14 @@ D-SSIM and L_perc, see the photo there.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from rtgs.core.cameras import Camera
+from rtgs.methods.shading.straight import FirstBounce, GlassRays
 from rtgs.scenes.scene import View
 from rtgs.train.method import Drawn, RenderedView
 
@@ -72,6 +74,14 @@ class DrawnTiles:
         """The errors, from a checkpoint's state."""
         names = {number: f"{_ERRORS}.{number}" for number in self._number.values()}
         self._errors = {number: state[name].clone() for number, name in names.items() if name in state}
+
+
+def weighed(bounce: FirstBounce | None, drawn: Drawn | None, traced: Tensor, rays: GlassRays) -> FirstBounce | None:
+    """What the first ``rays`` met, with the weights of their pixels; ``traced`` (P,) int64 flattened pixels."""
+    if bounce is None or drawn is None:
+        return bounce
+    pixels = traced[rays.rows[rays.second]]
+    return replace(bounce, weight=drawn.weight.flatten()[pixels])
 
 
 def _place(camera: Camera) -> bytes:

@@ -19,10 +19,10 @@ from rtgs.mesh.container import ObjectGuide, ObjectMesh
 from rtgs.mesh.silhouettes import bounding
 from rtgs.mesh.spread import ObjectSurfaces
 from rtgs.methods.parts.base import BaseSet, composited
-from rtgs.methods.parts.drawn_tiles import DrawnTiles
+from rtgs.methods.parts.drawn_tiles import DrawnTiles, weighed
 from rtgs.methods.parts.gaussian_set import GaussianSet, densified, opacity_reset
 from rtgs.methods.parts.glass_evidence import glass_faces, kept_in_base, left_out, reason_against
-from rtgs.methods.parts.glass_pixels import object_pixels, views_without_glass
+from rtgs.methods.parts.glass_pixels import learned_weights, object_pixels, views_without_glass
 from rtgs.methods.parts.glass_sets import drawn_in_box, interface_set, taken_from_base, transmittance_set
 from rtgs.methods.parts.interface_set import InterfaceSet, interface_surfels
 from rtgs.methods.parts.mirror import Mirror, Reflected, stored_surfels
@@ -37,7 +37,7 @@ from rtgs.methods.shading.bent import Bend, bent_paths
 from rtgs.methods.shading.lights import Light, Traced, lit_view, mean_of_lights
 from rtgs.methods.shading.mirror import SurfacePixels, reflected_weight
 from rtgs.methods.shading.outline import Outline, beside_light
-from rtgs.methods.shading.straight import GlassPixels, Transmission, glass_rays, glass_weights
+from rtgs.methods.shading.straight import GlassPixels, Transmission, glass_rays
 from rtgs.methods.shading.wall_weights import WallWeights, wall_weights
 from rtgs.train.method import Observation, RenderedView, RenderOptions, Stage, StepEvent
 from rtgs.train.parameters import ParameterGroup
@@ -243,9 +243,7 @@ class Glass(Part):
             lights = (*lights, beside_light(outline, weights.beside, passed.beside))
         maps = {"transparent": glass.inside.reshape(shape), "specular": flat.specular.reshape(shape)}
         seen = (*met.observations, *passed.observations)
-        bounce = passed.first_bounce
-        if bounce is not None and drawn is not None:
-            bounce = replace(bounce, weight=drawn.weight.flatten()[chosen.index[straight.rows[straight.second]]])
+        bounce = weighed(passed.first_bounce, drawn, chosen.index, straight)
         traced = Traced(glass.flat, chosen, met.pixels, lights, maps, bounce, seen)
         return replace(lit_view(frame, raster, traced, self.settings.optics), drawn=drawn)
 
@@ -299,16 +297,12 @@ class Glass(Part):
     ) -> WallWeights:
         """Of the lights of the traced ``pixels`` (P,), with the S_max and the bound of the object's; ``inside`` (P,)
         bool."""
-        settings, optics, cosine = self.settings.transmittance, self.settings.optics, met.cosine
-        bounded = settings.max_weight > 0 and settings.interface.count > 0
-        reflection = reflected_weight(cosine, met.pixels, optics)
-        if self.wall is not None:
-            shown = self.wall.shown(camera, pixels, inside, outline)
-            return wall_weights(reflection, cosine, met.pixels.specular, shown)
-        optics = optics if settings.max_gain is None else replace(optics, max_gain=settings.max_gain)
-        largest = settings.max_weight if bounded else 0.0
-        found = glass_weights(reflection, cosine, met.pixels, inside, optics, largest, settings.weight_bound)
-        return WallWeights(*found, beside=None)
+        reflection = reflected_weight(met.cosine, met.pixels, self.settings.optics)
+        if self.wall is None:
+            found = learned_weights(self.settings, reflection, met.cosine, met.pixels, inside)
+            return WallWeights(*found, beside=None)
+        shown = self.wall.shown(camera, pixels, inside, outline)
+        return wall_weights(reflection, met.cosine, met.pixels.specular, shown)
 
     def _straight(self, frame: Frame, shape: ActivatedGaussians | None) -> StraightRays:
         assert self.guide is not None

@@ -1,8 +1,10 @@
-"""Which pixels of a view show the transparent object: those of its mask, of its silhouette, or of both."""
+"""Which pixels of a view show the transparent object: those of its mask, of its silhouette, or of both; and their
+learned weights."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -12,9 +14,9 @@ from rtgs.core.decisions import Decision
 from rtgs.mesh.silhouettes import bounding
 from rtgs.mesh.spread import ObjectSurfaces
 from rtgs.methods.parts.part import Frame
-from rtgs.methods.settings import TransmittanceSettings
+from rtgs.methods.settings import MethodSettings, TransmittanceSettings
 from rtgs.methods.shading.mirror import SurfacePixels
-from rtgs.methods.shading.straight import GlassPixels, glass_pixels, widened
+from rtgs.methods.shading.straight import GlassPixels, glass_pixels, glass_weights, widened
 
 if TYPE_CHECKING:
     from rtgs.scenes.scene import View
@@ -83,3 +85,14 @@ def object_pixels(
         first_surface=settings.first_surface,
         normal=settings.normal,
     )
+
+
+def learned_weights(
+    settings: MethodSettings, reflection: Tensor, cosine: Tensor, pixels: SurfacePixels, inside: Tensor
+) -> tuple[Tensor, Tensor]:
+    """w_r and w_t of P traced pixels of an object whose walls reflect by learned weights, with the S_max and the bound
+    of the settings; arguments as of :func:`rtgs.methods.shading.straight.glass_weights`."""
+    glass, optics = settings.transmittance, settings.optics
+    optics = optics if glass.max_gain is None else replace(optics, max_gain=glass.max_gain)
+    largest = glass.max_weight if glass.interface.count > 0 else 0.0
+    return glass_weights(reflection, cosine, pixels, inside, optics, largest, glass.weight_bound)
