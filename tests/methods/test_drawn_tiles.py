@@ -12,11 +12,11 @@ from torch import Tensor
 from rtgs.core.errors import RtgsError
 from rtgs.methods import Mode, RenderOptions
 from rtgs.methods.model import Model
-from rtgs.methods.parts.drawn_tiles import LEAST, DrawnTiles
+from rtgs.methods.parts.drawn_tiles import LEAST, DrawnTiles, weighed
 from rtgs.methods.parts.glass import Glass
 from rtgs.methods.parts.mirror import Mirror
 from rtgs.methods.settings import MethodSettings
-from rtgs.methods.shading.straight import FirstBounce, depth_loss
+from rtgs.methods.shading.straight import FirstBounce, GlassRays, depth_loss
 from rtgs.scenes.scene import View
 from rtgs.train.held_out import psnr_of
 from rtgs.train.method import Drawn, RenderedView
@@ -100,7 +100,9 @@ def test_all_is_traced_where_nothing_is_known(made: GlassScene):
     half = replace(view.camera, width=12, height=9, fx=view.camera.fx / 2, fy=view.camera.fy / 2, cx=6.0, cy=4.5)
     assert method.render(half, STEP, Mode.TRAIN).drawn is None
     assert method.render(view.camera, STEP, Mode.EVALUATE, mask=view.mask).drawn is None
-    assert in_training(begun(fresnel(), made), view).drawn is None
+    whole = seen(made, fresnel(), view)  # where all is traced no error is kept
+    assert in_training(whole, view).drawn is None
+    assert not any("drawn_errors" in name for name in whole.state())
     tiles, view, inside = tiles_of(made, torch.zeros(3, 3), 0.5)
     assert tiles.draw(view.camera, inside) is None
     tiles, view, inside = tiles_of(made, torch.ones(3, 3), 0.5)
@@ -174,7 +176,8 @@ def test_errors_are_those_of_the_glass_in_the_tiles_that_were_drawn(made: GlassS
     rendered = in_training(method, view)
     assert rendered.drawn is not None
     inside = rendered.maps["transparent"]
-    glass.saw(replace(rendered, image=torch.where(inside, view.image + 0.125, 7.0)), replace(view, image=view.image))
+    assert float(view.image.max()) > 0.5
+    glass.saw(replace(rendered, image=torch.where(inside, view.image + 0.5, 7.0)), view)
     after = glass.tiles.state()["drawn_errors.0"]
     checked = 0
     for row in range(3):
@@ -184,7 +187,7 @@ def test_errors_are_those_of_the_glass_in_the_tiles_that_were_drawn(made: GlassS
                 continue
             checked += 1
             if bool((rendered.drawn.pixels & inside)[here].any()):
-                shown = ((view.image + 0.125).clamp(0, 1) - view.image).mean(0)[here]
+                shown = ((view.image + 0.5).clamp(0, 1) - view.image).mean(0)[here]
                 expected = float(shown[inside[here]].mean())
                 assert float(after[row, column]) == pytest.approx(expected, rel=1e-5)
             else:
@@ -212,6 +215,19 @@ def test_first_bounces_have_the_weights_of_their_pixels(made: GlassScene, monkey
     assert rendered.kept.weight is not None
     assert torch.equal(rendered.kept.weight, expected)
     assert len(expected.unique()) > 1
+
+
+def test_rays_without_a_second_surface_have_no_first_bounce_to_weigh():
+    drawn, near = Drawn(torch.tensor([[1.0, 2.0, 4.0, 0.0]])), torch.ones(3)
+    traced, rows, second = torch.tensor([2, 0, 1]), torch.tensor([0, 1, 2]), torch.tensor([True, False, True])
+    rays = GlassRays(rows, 3, torch.zeros(3), torch.ones(3, 3), near, near, second)
+    bounce = FirstBounce(torch.ones(2), torch.ones(2), torch.ones(2))
+    found = weighed(bounce, drawn, traced, rays)
+    assert found is not None
+    assert found.weight is not None
+    assert found.weight.tolist() == [4.0, 2.0]
+    assert weighed(bounce, None, traced, rays) is bounce
+    assert weighed(None, drawn, traced, rays) is None
 
 
 @pytest.mark.parametrize("form", ["accum", "mean"])
