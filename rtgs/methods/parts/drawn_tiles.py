@@ -40,10 +40,12 @@ class DrawnTiles:
     def draw(self, camera: Camera, inside: Tensor) -> Drawn | None:
         """What a step on the view traces; ``inside`` (H * W,) bool: the object's pixels. None: all, for nothing is
         known of this view in this size."""
-        errors = self._errors.get(self._number.get(_place(camera), -1))
+        errors = self._errors.get(self._number.get(_place(camera), -1)) if self._errors else None
+        if errors is None:
+            return None
         shown = inside.reshape(camera.height, camera.width)
         share = _of_tiles(shown.float())
-        if errors is None or errors.shape != share.shape:
+        if errors.shape != share.shape:
             return None
         mean = float((errors * share).sum() / share.sum().clamp_min(1e-9))
         if mean <= 0:
