@@ -28,20 +28,13 @@ WallLeg leg_of(const LegArrays& arrays, const Floats& wall, const GlassNumbers& 
           checked_threads(threads)};
 }
 
-using Rows = nb::ndarray<const int64_t, nb::c_contig, nb::device::cpu>;
 using TwoRows = std::tuple<Rows, Rows>;                          // of behind, of arriving
 using BehindArrays = std::tuple<Maybe, Floats, Floats, Floats>;  // alpha, behind, arriving, cosine
 
 // Where each ray's row is in a list of rays, in whole registers of any length; -1: it is not in it.
 std::vector<int32_t> places_of(const Rows& rows, int64_t count) {
   std::vector<int32_t> place(size_t((count + 15) / 16 * 16), -1);
-  for (size_t k = 0; k < rows.size(); ++k) {
-    const int64_t row = rows.data()[k];
-    if (row < 0 || row >= count || place[size_t(row)] >= 0)
-      throw std::invalid_argument("wall: row " + std::to_string(row) + " of " + std::to_string(count) +
-                                  " rays; each can be named once");
-    place[size_t(row)] = int32_t(k);
-  }
+  put_rows(place, rows, count, "rays; each can be named once");
   return place;
 }
 

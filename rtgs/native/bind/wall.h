@@ -41,4 +41,16 @@ inline Glass glass_of(const GlassNumbers& numbers) {
   return {index, true, {red, green, blue}};
 }
 
+using Rows = nb::ndarray<const int64_t, nb::c_contig, nb::device::cpu>;
+
+// Puts the number of each of `rows` at its place, among `count` of which those with -1 are free.
+inline void put_rows(std::vector<int32_t>& place, const Rows& rows, int64_t count, const char* told) {
+  for (size_t k = 0; k < rows.size(); ++k) {
+    const int64_t row = rows.data()[k];
+    if (row < 0 || row >= count || place[size_t(row)] != -1)
+      throw std::invalid_argument("wall: row " + std::to_string(row) + " of " + std::to_string(count) + " " + told);
+    place[size_t(row)] = int32_t(k);
+  }
+}
+
 }  // namespace rtgs

@@ -6,7 +6,6 @@ namespace rtgs {
 namespace {
 
 using Flags = nb::ndarray<const bool, nb::c_contig, nb::device::cpu>;
-using Rows = nb::ndarray<const int64_t, nb::c_contig, nb::device::cpu>;
 using PixelArrays = std::tuple<Floats, Floats, Flags, Maybe>;        // reflection, cosine, inside, walls or None
 using EdgeArrays = std::tuple<Rows, Floats, Floats, Floats, Floats>;  // rows, k_s of all pixels, R, wall, a
 
@@ -15,15 +14,7 @@ std::vector<int32_t> places_of(const Flags& inside, const std::optional<EdgeArra
   const int64_t count = int64_t(inside.size());
   std::vector<int32_t> place(size_t((count + 15) / 16 * 16), kNoGlass);
   for (int64_t k = 0; k < count; ++k) place[size_t(k)] = inside.data()[k] ? -1 : kNoGlass;
-  if (!edges) return place;
-  const Rows& rows = std::get<0>(*edges);
-  for (size_t k = 0; k < rows.size(); ++k) {
-    const int64_t row = rows.data()[k];
-    if (row < 0 || row >= count || place[size_t(row)] != -1)
-      throw std::invalid_argument("wall: row " + std::to_string(row) + " of " + std::to_string(count) +
-                                  " pixels; each can be named once, and is one of the object's");
-    place[size_t(row)] = int32_t(k);
-  }
+  if (edges) put_rows(place, std::get<0>(*edges), count, "pixels; each can be named once, and is one of the object's");
   return place;
 }
 
