@@ -53,7 +53,8 @@ struct WallPixels {  // P traced pixels
   int64_t count;
   const float *reflection, *cosine;  // (P) w_r where there is no glass, n . omega_o
   const float* walls;                // (P) 1: there is a wall, 0: an opening; null: 1
-  const int32_t* place;              // (whole registers of P) a pixel's row at the outline; -1: glass elsewhere; kNoGlass
+  // (whole registers of P) a pixel's row at the outline; -1: it is glass elsewhere; kNoGlass
+  const int32_t* place;
   // (P) k_s, and of rows at the outline R, the share that meets a wall, and a; null: no pixel is there
   const float *specular, *edge_reflected, *edge_wall, *edge_share;
   Glass glass;

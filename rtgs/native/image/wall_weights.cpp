@@ -24,8 +24,10 @@ struct PixelGroup {  // of kLanes pixels
     reflected = select(glass, walls * surface.reflected(), load_first(in.reflection + first, lanes));
     met = walls;
     if (any(edges)) look_beside(in, first, lanes);
-    for (int k = 0; k < colors; ++k)
-      passing.v[k] = where(glass, in.glass.tinted ? (1.f - met) + (met - reflected) * in.glass.tint[k] : 1.f - reflected);
+    for (int k = 0; k < colors; ++k) {
+      const vfloat tinted = (1.f - met) + (met - reflected) * in.glass.tint[k];
+      passing.v[k] = where(glass, in.glass.tinted ? tinted : 1.f - reflected);
+    }
   }
   // q = (1 - a) / k_s, at most 1
   void look_beside(const WallPixels& in, int64_t first, int lanes) {
