@@ -1,4 +1,4 @@
-"""The graph of a run: (sfm, masks, normals ->) import -> a step per stage (+ mesh, judge) -> render, evaluate, report.
+"""The graph of a run: (sfm, masks, normals ->) import -> a step per stage (+ teachers, mesh, judge) -> results.
 
 Pure: from a config to steps with parameters; nothing runs here. Each step is given only what it reads.
 """
@@ -6,7 +6,9 @@ Pure: from a config to steps with parameters; nothing runs here. Each step is gi
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 
+from pipelines.planning.distilling import distilling_of
 from pipelines.planning.inspection import Inspections
 from pipelines.planning.judge import (
     Opponent,
@@ -30,6 +32,7 @@ from pipelines.steps import (
     judge,
     masks,
     normals,
+    pseudo_views,
     render,
     report,
     sfm,
@@ -53,6 +56,7 @@ KINDS: tuple[StepKind, ...] = (
     masks.STEP,
     normals.STEP,
     import_scene.STEP,
+    pseudo_views.STEP,
     *train.training_kinds(),
     extract_mesh.STEP,
     judge.STEP,
@@ -79,6 +83,7 @@ class RunGraph:
     report: Step
     mesh: Step | None = None
     judge: tuple[Step, ...] = ()  # the plain method's training, the judge, the rest of that training
+    distill: tuple[Step, ...] = ()  # teachers' trainings, and what they show between the photos
     skipped: tuple[Decision, ...] = ()  # ``what`` is the name of the step
     unread: tuple[Decision, ...] = ()  # what the settings ask for and no step does
     moved: tuple[Decision, ...] = ()  # what happens at another time than in other scenes
@@ -106,7 +111,9 @@ def build_graph(config: RunConfig, choices: Choices, inspections: Inspections | 
     transparency = find_transparency(config, inspection, prepared)
     networks = tuple(found for found in _pretrained() if found[1] != ABSENT)  # without them the key stays as it was
     opponent = Opponent.of(config, choices)
-    training, object_mesh = _training(config, prepared, opponent, transparency.present, networks)
+    train_on = partial(_training, prepared=prepared, transparent=transparency.present, networks=networks)
+    distilling = distilling_of(config, choices, scene, train_on)
+    training, object_mesh = train_on(config, distilling.mesh, opponent=opponent, pseudo=distilling.pseudo)
     judging = judging_of(config, opponent, scene, training, networks)
     judge_steps = () if judging is None else judging.steps
     if judging is not None:
@@ -130,8 +137,9 @@ def build_graph(config: RunConfig, choices: Choices, inspections: Inspections | 
     late = (*why_judged_late(config, opponent), *why_photos_unseen(config))
     moved = (*_in_this_scene(config, transparency.present), *late)
     params = _report_params(config, choices, skipped, (*unread, *moved))
-    page = report.STEP.step(params, *prepared.steps, scene, *training, *judge_steps, *made)
-    return RunGraph(scene, training, rendered, measured, page, mesh, judge_steps, skipped, unread, moved)
+    page = report.STEP.step(params, *prepared.steps, scene, *distilling.steps, *training, *judge_steps, *made)
+    taught = distilling.steps
+    return RunGraph(scene, training, rendered, measured, page, mesh, judge_steps, taught, skipped, unread, moved)
 
 
 def _rendered(config: RunConfig, scene: Step, *upstream: Step) -> Step:
@@ -179,13 +187,22 @@ def _left_out(config: RunConfig, transparency: Transparency, object_mesh: Step |
 
 
 def _training(
-    config: RunConfig, prepared: Preparation, opponent: Opponent | None, transparent: bool, networks: Named
+    config: RunConfig,
+    object_mesh: Step | None = None,
+    *,
+    label: str = "",
+    prepared: Preparation,
+    transparent: bool,
+    networks: Named,
+    opponent: Opponent | None = None,
+    pseudo: tuple[Step, ...] = (),
 ) -> tuple[tuple[Step, ...], Step | None]:
-    """One training step per stage, up to where it is judged, and the object mesh that a third one builds on."""
+    """One training step per stage, up to where it is judged, and the object mesh that a third one builds on: the given
+    one, else of its own second stage. ``label``: what the names of the steps end with."""
     scene = prepared.scene
     method: MethodSettings = replace(config.method, paper_schedule=ScheduleSettings())  # a preset has read it by now
     steps: list[Step] = []
-    object_mesh = None
+    met = False  # the stage that the mesh is for
     spec = find_method(method.name)
     method = photos_as_judged(config, method.in_scene(glass=_through_glass(config, transparent)))
     if spec.elsewhere:
@@ -194,11 +211,13 @@ def _training(
         own = spec.stage(stage.name)
         read = own.reads(method)  # so that runs that differ elsewhere share the stage
         params = StageParams(read, config.schedule, config.seed, stage.name, stage.from_step, stage.until, config.watch)
-        if own.needs_object:
+        met |= own.needs_object
+        if met and object_mesh is None:
             drawn = (step for step in prepared.steps if draws_panes(step))
             object_mesh = extract_mesh.STEP.step(extract_mesh.object_params(config), *drawn, scene, *steps)
-        mesh = () if object_mesh is None else (object_mesh,)
-        steps.append(train.train_step(spec, params, scene, *steps, *mesh, networks=networks))
+        mesh = (object_mesh,) if met and object_mesh is not None else ()
+        name = f"{train.kind_of(own).name}{label}"
+        steps.append(train.train_step(spec, params, scene, *pseudo, *steps, *mesh, networks=networks, name=name))
     return tuple(steps), object_mesh
 
 
@@ -274,6 +293,7 @@ def shown_values(config: RunConfig) -> dict[str, object]:
     hidden = hidden if config.watch.on else (*hidden, "watch.")
     if not config.judge.plain and not config.scene.hold_out:  # pages of runs without a judge stay as they were
         hidden = (*hidden, "judge.", "scene.hold_out")
+    hidden = hidden if config.distill.teachers else (*hidden, "distill.")
     return {key: value for key, value in flatten(asdict(config)).items() if not key.startswith(hidden)}
 
 

@@ -7,7 +7,7 @@ import math
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,13 +16,14 @@ from rtgs.core.documents import DocumentError, parse_json
 from rtgs.core.memory import share_one_heap
 from rtgs.core.records import read_json, record_of, write_json
 from rtgs.runs.mixture import TRAININGS
-from rtgs.runs.training import CHECKPOINT_FOLDER, HISTORY_FILE, OBJECT_FOLDER, StageParams
+from rtgs.runs.training import CHECKPOINT_FOLDER, HISTORY_FILE, OBJECT_FOLDER, PSEUDO_VIEWS, StageParams
 from rtgs.track import Tracker
 from rtgs.workflow import StepContext
 
 if TYPE_CHECKING:
     from rtgs.mesh.container import ObjectMesh
     from rtgs.methods.model import Model
+    from rtgs.runs.pseudo import PseudoViews
     from rtgs.train.trainer import TrainSummary
 
 SUMMARY_FILE = "summary.json"
@@ -33,7 +34,8 @@ def train_stage(params: StageParams, context: StepContext, object_mesh: ObjectMe
 
     Writes ``checkpoint/`` (state of the method at the end), ``<set>.ply`` for every set of surfels, ``summary.json``,
     ``history.jsonl`` (the recorded metrics), ``pictures/`` of fixed views where the training is long enough, and with
-    an ``object_mesh`` a copy of it in ``object_mesh/``. Returns the trained method.
+    an ``object_mesh`` a copy of it in ``object_mesh/``. Pseudo views among the inputs are trained on as well, and what
+    their models cost counts. Returns the trained method.
 
     Raises:
         TrainingDiverged: a loss or gradient is not finite.
@@ -51,6 +53,9 @@ def train_stage(params: StageParams, context: StepContext, object_mesh: ObjectMe
 
     share_one_heap()
     scene = context.read("import_scene", read_scene)
+    pseudo = _pseudo_views(context)
+    if pseudo is not None:
+        scene = replace(scene, pseudo=pseudo.views)
     generator = generator_for(params.seed, "initialise")
     method = create_method(params.method, scene, params.schedule, generator, object_mesh)
     stage = Stage(params.stage, params.from_step, params.until, params.joined)
@@ -73,8 +78,11 @@ def train_stage(params: StageParams, context: StepContext, object_mesh: ObjectMe
         observer=TrainingPictures(scene, context.partial / FOLDER, params.schedule.total),
         watch=params.watch,
         onlooker=context.onlooker,
+        spent=None if pseudo is None else pseudo.spent,
     )
     summary = trainer.run()
+    if pseudo is not None:
+        summary = replace(summary, peak_memory_mb=max(summary.peak_memory_mb, pseudo.peak_memory_mb))
     newest = max(checkpoints.glob("step_*"))
     shutil.copytree(newest, context.out / CHECKPOINT_FOLDER)
     if object_mesh is not None:
@@ -90,6 +98,14 @@ def train_stage(params: StageParams, context: StepContext, object_mesh: ObjectMe
     numbers = {f"final/{key}": value for key, value in record.items() if isinstance(value, (int, float))}
     context.tracker.metrics(numbers)
     return method
+
+
+def _pseudo_views(context: StepContext) -> PseudoViews | None:
+    """Those among the inputs of a training; None: it is on photos alone."""
+    from rtgs.runs.pseudo import read_pseudo
+
+    folder = context.inputs.get(PSEUDO_VIEWS)
+    return None if folder is None else read_pseudo(folder)
 
 
 def _start_from_stage_before(context: StepContext, checkpoints: Path) -> None:

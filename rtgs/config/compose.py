@@ -43,20 +43,42 @@ def compose_plain(method: str, choices: Choices) -> tuple[MethodSettings, Schedu
     Raises:
         hydra.errors.HydraException: no such method or preset.
     """
+    shared = ("schedule.", "steps_scaler=")
+    words = [word for word in choices.overrides if word.lstrip("+~").startswith(shared)]
+    return _own_numbers(_groups(choices, method=method, ablation="", experiment=""), words)
+
+
+def compose_teacher(preset: str, choices: Choices) -> tuple[MethodSettings, ScheduleSettings]:
+    """The recipe of a run at another preset, with its ablation, its experiment and its words for the training; an empty
+    ``preset`` is the run's own.
+
+    Raises:
+        hydra.errors.HydraException: no such preset.
+    """
+    ours = ("method.", "schedule.", "steps_scaler=")
+    words = [word for word in choices.overrides if word.lstrip("+~").startswith(ours)]
+    return _own_numbers(_groups(choices, **({"preset": preset} if preset else {})), words)
+
+
+def _groups(choices: Choices, **others: str) -> list[str]:
+    """The words that choose the files of a run, some of them others; those of an empty name are left out."""
+    names = ("method", "preset", "ablation", "experiment")
+    chosen = {"scene": choices.scene_file, **{name: getattr(choices, name) for name in names}} | others
+    return [f"{group}={name}" for group, name in chosen.items() if name]
+
+
+def _own_numbers(groups: list[str], words: list[str]) -> tuple[MethodSettings, ScheduleSettings]:
+    """The method and the schedule of a command, scaled."""
     from hydra import compose as hydra_compose
     from hydra.core.global_hydra import GlobalHydra
     from omegaconf import OmegaConf
 
-    chosen = {"scene": choices.scene_file, "preset": choices.preset}
-    words = [f"method={method}", *(f"{group}={name}" for group, name in chosen.items() if name)]
-    shared = ("schedule.", "steps_scaler=")
-    words += [word for word in choices.overrides if word.lstrip("+~").startswith(shared)]
     register_schema()
     if GlobalHydra.instance().is_initialized():  # in a job: it knows the folders that the command line adds
-        composed = hydra_compose("config", overrides=words)
+        composed = hydra_compose("config", overrides=[*groups, *words])
     else:
         with opened_configs():
-            composed = hydra_compose("config", overrides=words)
+            composed = hydra_compose("config", overrides=[*groups, *words])
     found, schedule = (OmegaConf.to_container(composed[group], resolve=True) for group in ("method", "schedule"))
     assert isinstance(found, dict)
     assert isinstance(schedule, dict)

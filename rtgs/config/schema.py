@@ -130,6 +130,25 @@ class JudgeConfig:
 
 
 @dataclass(frozen=True)
+class DistillConfig:
+    """Models with other seeds teach the one of the run what they agree on between the photos (docs/training.md)."""
+
+    teachers: int = 0
+    """How many are trained before it, each with a seed of its own: seed + 1000, seed + 2000 and so on. 0: none."""
+    preset: str = ""
+    """The preset of their recipe, on the scene of the run. Empty: the run's."""
+    views: int = 3
+    """Visits of pseudo views, which show their mean picture, for each visit of a photo."""
+    most: int = 240
+    """Pseudo views at most; beyond, each is visited more often. They take memory as photos do."""
+
+    def __post_init__(self) -> None:
+        refuse_unless(self.teachers == 0 or 2 <= self.teachers <= 9, "distill.teachers", self.teachers, "0, or 2 to 9")
+        refuse_below("distill.views", self.views, 1)
+        refuse_below("distill.most", self.most, 1)
+
+
+@dataclass(frozen=True)
 class TableConfig:
     """The table that a sweep ends with (:mod:`rtgs.evaluate.publish`); set by files of ``conf/experiment``."""
 
@@ -184,6 +203,7 @@ class RunConfig:
     mesh: MeshConfig = field(default_factory=MeshConfig)
     ablation: AblationConfig = field(default_factory=AblationConfig)
     judge: JudgeConfig = field(default_factory=JudgeConfig)
+    distill: DistillConfig = field(default_factory=DistillConfig)
     table: TableConfig = field(default_factory=TableConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     paths: PathsConfig = field(default_factory=PathsConfig)

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 CHECKPOINT_FOLDER = "checkpoint"
 OBJECT_FOLDER = "object_mesh"
 HISTORY_FILE = "history.jsonl"
+PSEUDO_VIEWS = "pseudo_views"  # the step whose pictures a training learns beside the photos
 
 
 @dataclass(frozen=True)

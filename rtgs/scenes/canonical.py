@@ -31,8 +31,8 @@ _TRUTH_PREFIX = "truth."
 
 
 @dataclass(frozen=True)
-class _ViewEntry:
-    """A view in scene.json; floats keep all their digits in JSON."""
+class ViewEntry:
+    """A view in a JSON file; floats keep all their digits there."""
 
     name: str
     file: str
@@ -62,7 +62,7 @@ def save_scene(scene: Scene, folder: Path) -> None:
         if view.truth is not None:
             tensors |= {f"{_TRUTH_PREFIX}{name}": tensor for name, tensor in view.truth.tensors().items()}
         save_file({key: t.contiguous() for key, t in tensors.items() if t is not None}, folder / file)
-        entries[part].append(asdict(_entry(view, file)))
+        entries[part].append(asdict(entry_of(view, file)))
     save_file(
         {"points": scene.points.contiguous(), "point_colors": scene.point_colors.contiguous()}, folder / POINTS_FILE
     )
@@ -118,9 +118,10 @@ def read_scene(folder: Path) -> Scene:
         ) from error
 
 
-def _entry(view: View, file: str) -> _ViewEntry:
+def entry_of(view: View, file: str) -> ViewEntry:
+    """A view whose picture lies in ``file``."""
     camera = view.camera
-    return _ViewEntry(
+    return ViewEntry(
         name=view.name,
         file=file,
         camera_name=camera.name,
@@ -136,11 +137,15 @@ def _entry(view: View, file: str) -> _ViewEntry:
 
 
 def _views(folder: Path, entries: Sequence[Mapping[str, Any]]) -> tuple[View, ...]:
-    return tuple(_view(folder, record_of(_ViewEntry, entry, folder / SCENE_FILE)) for entry in entries)
+    return tuple(_view(folder, record_of(ViewEntry, entry, folder / SCENE_FILE)) for entry in entries)
 
 
-def _view(folder: Path, entry: _ViewEntry) -> View:
-    tensors: dict[str, Tensor] = load_file(path_inside(folder, entry.file, folder / SCENE_FILE, CaptureError))
+def camera_of(entry: ViewEntry) -> Camera:
+    """The camera of a view.
+
+    Raises:
+        ValueError: it is none.
+    """
     camera = Camera(
         torch.tensor(entry.rotation, dtype=torch.float64),
         torch.tensor(entry.translation, dtype=torch.float64),
@@ -155,6 +160,12 @@ def _view(folder: Path, entry: _ViewEntry) -> View:
     numbers = (camera.fx, camera.fy, camera.cx, camera.cy)
     if wrong := check_lens(Lens("PINHOLE", camera.width, camera.height, numbers), entry.name):
         raise ValueError(wrong)
+    return camera
+
+
+def _view(folder: Path, entry: ViewEntry) -> View:
+    tensors: dict[str, Tensor] = load_file(path_inside(folder, entry.file, folder / SCENE_FILE, CaptureError))
+    camera = camera_of(entry)
     if tensors["image"].shape != (3, camera.height, camera.width):
         raise ValueError(f"{entry.file} is of another size than the camera of {entry.name}")
     truth = {

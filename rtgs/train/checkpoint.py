@@ -274,9 +274,9 @@ def _flush(path: Path) -> None:
 
 
 def scene_digest(scene: Scene) -> str:
-    """Digest of training and test views and points: cameras, and a sample of every image and normal map."""
+    """Digest of training, test and pseudo views and points: cameras, and a sample of every image and normal map."""
     sha = hashlib.sha256()
-    for view in (*scene.train, *scene.test):
+    for view in (*scene.train, *scene.test, *scene.pseudo):
         camera = view.camera
         sha.update(repr((view.name, camera.fx, camera.fy, camera.cx, camera.cy, *view.image.shape)).encode())
         for tensor in (camera.rotation, camera.translation, view.image.flatten()[::97]):

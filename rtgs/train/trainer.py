@@ -77,7 +77,7 @@ class Trainer:
     method : Method
         What is trained; :func:`rtgs.methods.create_method` makes it.
     scene : Scene
-        Training views, and test views for the figures.
+        Training views, pseudo views among them, and test views for the figures.
     seed : int
         Of the order of the views.
     stage : Stage, optional
@@ -97,6 +97,8 @@ class Trainer:
         When the test views are scored along the way, for the recorder; the clock stands still meanwhile. None: never.
     onlooker : Onlooker, optional
         Who looks at the method while it trains, and may ask it to end.
+    spent : ElapsedTime, optional
+        Training time that counts as this one's: of the models that the scene's pseudo views are of.
     """
 
     def __init__(
@@ -113,6 +115,7 @@ class Trainer:
         observer: Observer | None = None,
         watch: WatchSettings | None = None,
         onlooker: Onlooker | None = None,
+        spent: ElapsedTime | None = None,
     ) -> None:
         self.method = method
         self.scene = scene
@@ -127,14 +130,14 @@ class Trainer:
         self._watch = Watch(watch) if watch is not None and watch.on and not self._idle else None
         self._views = views
         joined = self.stage.joined > 0
-        self._photos = (*scene.train, *scene.held) if joined else scene.train
+        self._photos = (*scene.train, *(scene.held if joined else ()), *scene.pseudo)
         self._growing = GrowingViews(self._photos, self.schedule)
         self._order = ViewOrder(len(self._photos), seed_for(seed, "joined views" if joined else "views"))
         self._averages = RunningAverages()
         self._held_out = HeldOutView(scene, self.schedule.total)
         self._seen: float | None = None  # its PSNR when it was last looked at
         self._step = self.stage.from_step
-        self._elapsed_before = ElapsedTime()
+        self._elapsed_before = spent or ElapsedTime()
         self._clock = Clock()
         self._window: list[tuple[LossValue, ...]] = []
         self._seed = seed

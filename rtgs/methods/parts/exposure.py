@@ -20,6 +20,7 @@ from rtgs.core.decisions import Decision
 from rtgs.core.errors import RtgsError
 from rtgs.methods.parts.feature_mirror import SH_IMAGE
 from rtgs.methods.parts.part import Frame, Part
+from rtgs.scenes.between import squared_apart
 from rtgs.scenes.exposures import exposure_spread
 from rtgs.train.method import RenderedView
 from rtgs.train.parameters import ParameterGroup, Rate
@@ -134,9 +135,7 @@ def nearest_photos(camera: Camera, scene: Scene, count: int = NEAREST) -> tuple[
     weights (K,), which add up to 1: one over the squared distance, of the centre in scene extents and of the axis in
     radians."""
     cameras = [view.camera for view in scene.train]
-    centers, axes = (torch.stack(each) for each in ([c.center for c in cameras], [c.rotation[2] for c in cameras]))
-    angles = torch.arccos((axes @ camera.rotation[2]).clamp(-1, 1))
-    squares = ((centers - camera.center) / scene.extent).square().sum(1) + angles.square()
+    squares = squared_apart(camera, cameras, scene.extent)
     squares[[other is camera for other in cameras]] = torch.inf
     found, rows = squares.topk(min(count, len(squares)), largest=False)
     weights = 1 / (found + SAME)

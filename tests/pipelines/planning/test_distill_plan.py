@@ -1,0 +1,133 @@
+"""What teachers add to the graph of a run, and what they leave alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from pipelines.planning.distilling import APART
+from pipelines.planning.graph import RunGraph, build_graph, shown_values
+from pipelines.steps.pseudo_views import PseudoParams
+from rtgs.config import compose
+from rtgs.core.errors import RtgsError
+from rtgs.workflow import topological
+
+PLAIN = ("scene=toycar", "method=3dgs", "preset=smoke")
+GLASS = ("scene=ball_statue", "method=rtgs", "preset=smoke")
+
+
+def graph(*words: str) -> RunGraph:
+    return build_graph(*compose(words))
+
+
+def keys(found: RunGraph) -> dict[str, str]:
+    return {step.name: step.fingerprint for step in topological(found.targets) if step.name != "report"}
+
+
+def test_each_teacher_has_a_seed_of_its_own_and_only_the_pseudo_views_know_them():
+    found = graph(*PLAIN, "distill.teachers=3", "seed=2", "distill.views=2", "distill.most=50")
+    *teachers, pseudo = found.distill
+    (student,) = found.training
+    assert [step.name for step in teachers] == ["teacher_1", "teacher_2", "teacher_3"]
+    assert [step.params.seed for step in teachers] == [2 + APART, 2 + 2 * APART, 2 + 3 * APART]
+    assert all(replace(step.params, seed=2) == student.params for step in teachers)
+    assert all(step.upstream == (found.scene,) for step in teachers)
+    assert pseudo.upstream == (found.scene, *teachers)
+    assert pseudo.params == PseudoParams(views=2, most=50, seed=2)
+    assert student.upstream == (found.scene, pseudo)
+    for reader in (found.render, found.evaluate):
+        assert not {*found.distill} & {*reader.upstream}
+    assert {*found.distill} <= {*found.report.upstream}
+
+
+def test_a_run_without_teachers_is_what_it_was():
+    assert keys(graph(*PLAIN)) == keys(graph(*PLAIN, "distill.views=5", "distill.preset=standard"))
+    assert graph(*PLAIN).distill == ()
+    assert not any(key.startswith("distill.") for key in shown_values(compose(PLAIN)[0]))
+    assert shown_values(compose([*PLAIN, "distill.teachers=2"])[0])["distill.teachers"] == 2
+
+
+def test_teachers_have_the_recipe_of_their_preset_with_the_words_of_the_run():
+    words = ("scene=toycar", "method=2dgs", "preset=standard", "distill.teachers=2", "distill.preset=quick")
+    more = ("method.loss.normal=0.01", "steps_scaler=0.5", "watch.steps=[100]")
+    found = graph(*words, *more)
+    alone = graph("scene=toycar", "method=2dgs", "preset=quick", "scene.long_side=800", "seed=1000", *more[:2])
+    assert alone.scene.fingerprint == found.scene.fingerprint
+    assert found.distill[0].params == alone.training[0].params
+    assert (found.distill[0].params.schedule.total, found.training[0].params.schedule.total) == (1000, 2000)
+    assert found.distill[0].params.method.loss.normal == found.training[0].params.method.loss.normal == 0.01
+    assert found.distill[0].params.watch != found.training[0].params.watch
+
+
+def test_an_ablation_is_of_teachers_too():
+    words = ("scene=toycar", "method=3dgs", "ablation=no_dssim")
+    found = graph(*words, "preset=standard", "distill.teachers=2", "distill.preset=quick")
+    alone = graph(*words, "preset=quick", "scene.long_side=800", "seed=1000")
+    assert found.distill[0].params == alone.training[0].params
+    assert found.distill[0].params.method.loss.dssim == 0
+
+
+def test_a_method_of_several_stages_is_taught_in_all_of_them_and_builds_on_one_mesh():
+    found = graph(*GLASS, "distill.teachers=2")
+    first, second, pseudo = found.distill
+    assert [step.name for step in found.training] == ["train_diffuse", "train_reflection", "train_transmittance"]
+    assert all(pseudo in step.upstream for step in found.training)
+    assert (first.params.stage, second.params.stage) == ("transmittance", "transmittance")
+    names = [[step.name for step in teacher.upstream] for teacher in (first, second)]
+    stages = ["train_diffuse_of_teacher_{}", "train_reflection_of_teacher_{}"]
+    for number, found_names in enumerate(names, 1):
+        assert found_names == ["import_scene", *(stage.format(number) for stage in stages), "extract_mesh"]
+    meshes = {
+        step for teacher in (first, second, found.training[-1]) for step in teacher.upstream if "mesh" in step.name
+    }
+    assert len(meshes) == 1
+    assert next(iter(meshes)) in found.evaluate.upstream
+    assert [step.name for step in next(iter(meshes)).upstream] == [
+        "import_scene",
+        "train_diffuse_of_teacher_1",
+        "train_reflection_of_teacher_1",
+    ]
+    every = [step.name for step in topological(found.targets)]
+    assert len({*every}) == len(every)
+
+
+def test_a_judge_compares_the_taught_method():
+    found = graph(*PLAIN[:2], "preset=smoke", "method=2dgs", "judge=photos", "distill.teachers=2")
+    pseudo = found.distill[-1]
+    *until, rest = found.training
+    assert all(pseudo in step.upstream for step in (*until, rest))
+    assert pseudo not in found.judge[0].upstream
+    assert found.distill[0].params.method.appearance == until[0].params.method.appearance
+
+
+def test_high_is_standard_taught_by_three_of_quick():
+    for method in ("2dgs", "3dgs"):
+        words = ("scene=toycar", f"method={method}")
+        found, standard = graph(*words, "preset=high"), graph(*words, "preset=standard")
+        quick = graph(*words, "preset=quick", "scene.long_side=800", "seed=3000")
+        assert found.training[0].params == standard.training[0].params
+        assert found.distill[2].params == quick.training[0].params
+        assert len(found.distill) == 4
+
+
+@pytest.mark.parametrize("teachers", [-1, 1, 10])
+def test_a_number_of_teachers_that_teaches_nothing_is_refused(teachers: int):
+    with pytest.raises(RtgsError, match=r"distill\.teachers"):
+        compose([*PLAIN, f"distill.teachers={teachers}"])
+
+
+@pytest.mark.parametrize("word", ["distill.views=0", "distill.most=0"])
+def test_no_picture_is_refused(word: str):
+    with pytest.raises(RtgsError, match=word.split("=")[0]):
+        compose([*PLAIN, word])
+
+
+def test_high_is_not_for_a_method_that_it_was_not_measured_with():
+    with pytest.raises(RtgsError, match=r"preset=high has nothing of method envgs: it is for .*preset=standard"):
+        compose(["scene=toycar", "method=envgs", "preset=high"])
+
+
+def test_a_preset_that_is_none_is_told():
+    with pytest.raises(Exception, match="preset"):
+        graph(*PLAIN, "distill.teachers=2", "distill.preset=none_such")
