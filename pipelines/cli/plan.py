@@ -5,8 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from pipelines.planning.graph import RunGraph, build_graph
-from pipelines.planning.plan import MergedJobs, describe, jobs_of_words, merge_jobs, ready_job, remote_store
+from pipelines.planning.plan import (
+    Job,
+    MergedJobs,
+    configs_of,
+    describe,
+    jobs_of_words,
+    merge_jobs,
+    ready_job,
+    remote_store,
+)
 from pipelines.planning.rows import plan_rows
+from rtgs.config.sweep import ComposedJob
 from rtgs.core.listing import columns
 from rtgs.workflow import Plan, Store, make_plan
 
@@ -23,13 +33,19 @@ def plan_of_words(words: Sequence[str]) -> int:
         RtgsError: an option that ``rtgs plan`` does not know; a single run that could not start.
     """
     jobs, sweep = jobs_of_words(words)
-    if not sweep:
-        job = ready_job(jobs[0])
-        config = job.config
-        graph = build_graph(config, job.choices)
-        plan = make_plan(graph.targets, Store(config.paths.store), remote_store(config))
-        print("\n".join([single_table(graph, plan), "", *map(str, (*graph.unread, *graph.moved)), describe(plan)]))
-        return 0
+    with configs_of(words):
+        return _plan_of_sweep(jobs) if sweep else _plan_of_run(ready_job(jobs[0]))
+
+
+def _plan_of_run(job: Job) -> int:
+    config = job.config
+    graph = build_graph(config, job.choices)
+    plan = make_plan(graph.targets, Store(config.paths.store), remote_store(config))
+    print("\n".join([single_table(graph, plan), "", *map(str, (*graph.unread, *graph.moved)), describe(plan)]))
+    return 0
+
+
+def _plan_of_sweep(jobs: Sequence[ComposedJob]) -> int:
     problems = [(job.title, job.problem) for job in jobs if job.config is None]
     ready = [ready_job(job) for job in jobs if job.config is not None]
     merged = merge_jobs(ready)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pipelines.cli.app import RunOutcome, open_tracker, short, tracked_place
 from pipelines.planning.inspection import Inspections
-from pipelines.planning.plan import jobs_of_words
+from pipelines.planning.plan import configs_of, jobs_of_words
 from pipelines.planning.sweep import Sweep
 from rtgs.config.sweep import ComposedJob
 from rtgs.core.errors import RtgsError
@@ -82,11 +82,12 @@ def finished_elsewhere(words: Sequence[str], sweep: Sweep) -> tuple[list[RunOutc
     except (RtgsError, HydraException):
         return [], []
     outcomes, failures, inspections = [], [], Inspections()
-    for number, job in enumerate(jobs if several else ()):
-        try:
-            outcomes.append(_left_by(job, number, sweep, inspections))
-        except Exception as error:  # whatever it is, the job has stopped with it
-            failures.append(f"job {number} ({','.join(job.words)}): {error}")
+    with configs_of(words):
+        for number, job in enumerate(jobs if several else ()):
+            try:
+                outcomes.append(_left_by(job, number, sweep, inspections))
+            except Exception as error:  # whatever it is, the job has stopped with it
+                failures.append(f"job {number} ({','.join(job.words)}): {error}")
     return outcomes, failures
 
 

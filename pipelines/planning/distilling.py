@@ -2,25 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 from pipelines.steps import pseudo_views
 from rtgs.config.compose import compose_teacher
 from rtgs.config.schema import Choices, RunConfig
+from rtgs.core.errors import RtgsError
 from rtgs.methods import find_method
 from rtgs.train.settings import WatchSettings
 from rtgs.workflow import Step
-
-
-class Trainings(Protocol):
-    """The steps of a whole training, and the mesh of a transparent object that they build on: the given one, else of
-    their own. ``label``: what their names end with."""
-
-    def __call__(
-        self, config: RunConfig, object_mesh: Step | None, *, label: str
-    ) -> tuple[tuple[Step, ...], Step | None]: ...
-
 
 APART = 1000  # between the seeds of a run and of its teachers: those of a sweep over seeds stay apart
 
@@ -31,7 +22,6 @@ class Distilling:
 
     teachers: tuple[Step, ...] = ()
     pseudo: tuple[Step, ...] = ()  # one, or none where nobody teaches
-    mesh: Step | None = None  # of a transparent object: the first teacher's, which all others and the run build on
 
     @property
     def steps(self) -> tuple[Step, ...]:
@@ -39,23 +29,32 @@ class Distilling:
         return (*self.teachers, *self.pseudo)
 
 
-def distilling_of(config: RunConfig, choices: Choices, scene: Step, training: Trainings) -> Distilling:
-    """The teachers of a run, trained as it is on its scene.
+def distilling_of(
+    config: RunConfig, choices: Choices, scene: Step, training: Callable[[RunConfig], tuple[Step, ...]]
+) -> Distilling:
+    """The teachers of a run.
+
+    ``training``: the steps of a whole training on its scene.
 
     Raises:
+        RtgsError: the method trains in several stages.
         hydra.errors.HydraException: distill.preset is no preset.
     """
     asked = config.distill
     if asked.teachers == 0 or find_method(config.method.name).elsewhere:
         return Distilling()
     method, schedule = compose_teacher(asked.preset, choices)
-    teachers, mesh = [], None
+    teachers = []
     for number in range(1, asked.teachers + 1):
-        own = replace(
-            config, method=method, schedule=schedule, seed=config.seed + APART * number, watch=WatchSettings()
-        )
-        name = f"{pseudo_views.TEACHER}_{number}"
-        steps, mesh = training(own, mesh, label=f"_of_{name}")
-        teachers.append(replace(steps[-1], name=name))
+        seed = config.seed + APART * number
+        own = replace(config, method=method, schedule=schedule, seed=seed, watch=WatchSettings())
+        only, *more = training(own)
+        if more:
+            names = ", ".join(step.params.stage for step in (only, *more))
+            raise RtgsError(
+                f"distill.teachers={asked.teachers}: method {config.method.name} trains in several stages ({names}), "
+                "and teachers are for methods of one: leave distill.teachers at 0"
+            )
+        teachers.append(replace(only, name=f"{pseudo_views.TEACHER}_{number}"))
     shown = pseudo_views.PseudoParams(asked.views, asked.most, config.seed)
-    return Distilling(tuple(teachers), (pseudo_views.STEP.step(shown, scene, *teachers),), mesh)
+    return Distilling(tuple(teachers), (pseudo_views.STEP.step(shown, scene, *teachers),))

@@ -69,7 +69,7 @@ KINDS: tuple[StepKind, ...] = (
 """Every kind of step there is; the guard against forgotten version bumps goes through them."""
 
 _NOT_SHOWN = ("paths.", "tracking.", "table.", "name", "threads", "view", "scene.path", "method.paper_schedule.")
-_OF_TRAINING = ("method.", "schedule.", "mesh.", "seed", "ablation.")
+_OF_TRAINING = ("method.", "schedule.", "mesh.", "seed", "ablation.", "distill.")
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class RunGraph:
     report: Step
     mesh: Step | None = None
     judge: tuple[Step, ...] = ()  # the plain method's training, the judge, the rest of that training
-    distill: tuple[Step, ...] = ()  # teachers' trainings, and what they show between the photos
+    distill: tuple[Step, ...] = ()  # teachers' trainings, and what they show around the photos
     skipped: tuple[Decision, ...] = ()  # ``what`` is the name of the step
     unread: tuple[Decision, ...] = ()  # what the settings ask for and no step does
     moved: tuple[Decision, ...] = ()  # what happens at another time than in other scenes
@@ -112,8 +112,8 @@ def build_graph(config: RunConfig, choices: Choices, inspections: Inspections | 
     networks = tuple(found for found in _pretrained() if found[1] != ABSENT)  # without them the key stays as it was
     opponent = Opponent.of(config, choices)
     train_on = partial(_training, prepared=prepared, transparent=transparency.present, networks=networks)
-    distilling = distilling_of(config, choices, scene, train_on)
-    training, object_mesh = train_on(config, distilling.mesh, opponent=opponent, pseudo=distilling.pseudo)
+    distilling = distilling_of(config, choices, scene, lambda own: train_on(own)[0])
+    training, object_mesh = train_on(config, opponent=opponent, pseudo=distilling.pseudo)
     judging = judging_of(config, opponent, scene, training, networks)
     judge_steps = () if judging is None else judging.steps
     if judging is not None:
@@ -188,21 +188,18 @@ def _left_out(config: RunConfig, transparency: Transparency, object_mesh: Step |
 
 def _training(
     config: RunConfig,
-    object_mesh: Step | None = None,
     *,
-    label: str = "",
     prepared: Preparation,
     transparent: bool,
     networks: Named,
     opponent: Opponent | None = None,
     pseudo: tuple[Step, ...] = (),
 ) -> tuple[tuple[Step, ...], Step | None]:
-    """One training step per stage, up to where it is judged, and the object mesh that a third one builds on: the given
-    one, else of its own second stage. ``label``: what the names of the steps end with."""
+    """One training step per stage, up to where it is judged, and the object mesh that a third one builds on."""
     scene = prepared.scene
     method: MethodSettings = replace(config.method, paper_schedule=ScheduleSettings())  # a preset has read it by now
     steps: list[Step] = []
-    met = False  # the stage that the mesh is for
+    object_mesh = None
     spec = find_method(method.name)
     method = photos_as_judged(config, method.in_scene(glass=_through_glass(config, transparent)))
     if spec.elsewhere:
@@ -211,13 +208,11 @@ def _training(
         own = spec.stage(stage.name)
         read = own.reads(method)  # so that runs that differ elsewhere share the stage
         params = StageParams(read, config.schedule, config.seed, stage.name, stage.from_step, stage.until, config.watch)
-        met |= own.needs_object
-        if met and object_mesh is None:
+        if own.needs_object:
             drawn = (step for step in prepared.steps if draws_panes(step))
             object_mesh = extract_mesh.STEP.step(extract_mesh.object_params(config), *drawn, scene, *steps)
-        mesh = (object_mesh,) if met and object_mesh is not None else ()
-        name = f"{train.kind_of(own).name}{label}"
-        steps.append(train.train_step(spec, params, scene, *pseudo, *steps, *mesh, networks=networks, name=name))
+        mesh = () if object_mesh is None else (object_mesh,)
+        steps.append(train.train_step(spec, params, scene, *pseudo, *steps, *mesh, networks=networks))
     return tuple(steps), object_mesh
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
 from pipelines.planning.graph import RunGraph, build_graph
@@ -83,6 +84,16 @@ def remote_store(config: RunConfig) -> RemoteStore | None:
     return RemoteStore(config.paths.remote) if config.paths.remote else None
 
 
+def configs_of(words: Sequence[str]) -> AbstractContextManager[None]:
+    """In this block the files of the folder that ``--config-dir`` of these words names are found: composing a run needs
+    them, and so does building its graph where other recipes belong to it (a judge, teachers).
+
+    Raises:
+        RtgsError: the option is not used as it should be.
+    """
+    return with_configs(friendly_words(words)[1])
+
+
 def jobs_of_words(words: Sequence[str]) -> tuple[tuple[ComposedJob, ...], bool]:
     """The jobs that ``rtgs run <words>`` would start, and whether they are those of a sweep.
 
@@ -107,7 +118,8 @@ def steps_of_words(words: Sequence[str]) -> tuple[Step, ...]:
         RtgsError: a job of them could not start.
     """
     jobs, _ = jobs_of_words(words)
-    merged = merge_jobs([ready_job(job) for job in jobs])
+    with configs_of(words):
+        merged = merge_jobs([ready_job(job) for job in jobs])
     if merged.problems:
         raise RtgsError(": ".join(merged.problems[0]))
     return topological(merged.targets)

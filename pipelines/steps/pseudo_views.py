@@ -1,4 +1,4 @@
-"""Models trained on the same photos show what they agree on: their mean picture from places between the photos."""
+"""Models trained on the same photos show what they agree on: their mean picture from places around the photos."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def pseudo_views(params: PseudoParams, context: StepContext) -> None:
 
     from rtgs.core.memory import share_one_heap
     from rtgs.runs.pseudo import PseudoRecord, write_picture
-    from rtgs.scenes.between import cameras_between
+    from rtgs.scenes.around import cameras_around
     from rtgs.scenes.canonical import read_scene
     from rtgs.scenes.scene import View
     from rtgs.train.clock import Clock, ElapsedTime
@@ -51,7 +51,7 @@ def pseudo_views(params: PseudoParams, context: StepContext) -> None:
     scene = context.read("import_scene", read_scene)
     teachers = [folder for name, folder in context.inputs.items() if name.startswith(TEACHER)]
     visits = params.views * len(scene.train)
-    cameras = cameras_between(
+    cameras = cameras_around(
         [view.camera for view in scene.train],
         scene.extent,
         min(visits, params.most),

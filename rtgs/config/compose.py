@@ -43,8 +43,7 @@ def compose_plain(method: str, choices: Choices) -> tuple[MethodSettings, Schedu
     Raises:
         hydra.errors.HydraException: no such method or preset.
     """
-    shared = ("schedule.", "steps_scaler=")
-    words = [word for word in choices.overrides if word.lstrip("+~").startswith(shared)]
+    words = _words_of(choices, ("schedule", "steps_scaler"))
     return _own_numbers(_groups(choices, method=method, ablation="", experiment=""), words)
 
 
@@ -55,9 +54,13 @@ def compose_teacher(preset: str, choices: Choices) -> tuple[MethodSettings, Sche
     Raises:
         hydra.errors.HydraException: no such preset.
     """
-    ours = ("method.", "schedule.", "steps_scaler=")
-    words = [word for word in choices.overrides if word.lstrip("+~").startswith(ours)]
+    words = _words_of(choices, ("method", "schedule", "steps_scaler"))
     return _own_numbers(_groups(choices, **({"preset": preset} if preset else {})), words)
+
+
+def _words_of(choices: Choices, keys: tuple[str, ...]) -> list[str]:
+    """The words of a run that set one of these keys, or something under it."""
+    return [word for word in choices.overrides if _key(word).split(".")[0] in keys]
 
 
 def _groups(choices: Choices, **others: str) -> list[str]:
@@ -114,7 +117,7 @@ def choices_from(groups: Mapping[str, object], overrides: Sequence[str]) -> Choi
     keys = [
         item
         for item in _resolved(overrides)
-        if _key(item) not in told_otherwise and not _key(item).startswith(elsewhere)
+        if (_key(item) not in told_otherwise or _sets_values(item)) and not _key(item).startswith(elsewhere)
     ]
     return Choices(**chosen, scene_file=names.get("scene", ""), overrides=tuple(map(redact, keys)))
 
@@ -139,6 +142,11 @@ def _resolved(overrides: Sequence[str]) -> list[str]:
                 "or ${KEY} of a key that has a value of its own"
             ) from error
     return found
+
+
+def _sets_values(override: str) -> bool:
+    """Whether the word chooses no file of a group, but sets keys under it: ``method={loss:{dssim:0}}``."""
+    return override.partition("=")[2].lstrip().startswith("{")
 
 
 def _key(override: str) -> str:

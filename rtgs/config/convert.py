@@ -51,6 +51,8 @@ def to_run_config(composed: DictConfig, choices: Choices) -> tuple[RunConfig, Ch
     assert isinstance(values, dict)
     config = build(RunConfig, {str(key): value for key, value in values.items()})
     _refuse_preset_of_others(config, choices)
+    if config.distill.teachers:
+        _refuse_preset_of_others(config, replace(choices, preset=config.distill.preset), "distill.preset")
     _refuse_idle_ablation(config, choices)
     config = _of_external(config)
     method, schedule = scaled_steps(with_own(config.method), config.schedule, config.steps_scaler)
@@ -101,7 +103,7 @@ def with_own(method: MethodSettings) -> MethodSettings:
     return replace(method, own={k: v for k, v in asdict(made).items() if v != getattr(type(made)(), k)})
 
 
-def _refuse_preset_of_others(config: RunConfig, choices: Choices) -> None:
+def _refuse_preset_of_others(config: RunConfig, choices: Choices, key: str = "preset") -> None:
     """``preset=paper_<kind>`` is what authors publish for scenes of a kind, and ``high`` is for methods that it was
     measured to pay with: a method without a file for it has none.
 
@@ -113,7 +115,7 @@ def _refuse_preset_of_others(config: RunConfig, choices: Choices) -> None:
         return
     fit = [spec.name for spec in own_methods() if _has_preset(spec.name, preset)]
     instead = "preset=standard is there for all" if preset == HIGH else "preset=paper is its published schedule"
-    raise RtgsError(f"config: preset={preset} has nothing of method {method}: it is for {', '.join(fit)}; {instead}")
+    raise RtgsError(f"config: {key}={preset} has nothing of method {method}: it is for {', '.join(fit)}; {instead}")
 
 
 def _has_preset(method: str, preset: str) -> bool:

@@ -1,4 +1,4 @@
-"""Pseudo views in the store: pictures that trained models show between the photos, and what those models cost."""
+"""Pseudo views in the store: pictures that trained models show around the photos, and what those models cost."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ class Scene:
     noise_psnr: float | None = None  # dB of the test photos against noise-free ones, mean; where that is known
     random_points: bool = False  # the points are drawn at random: no photo agrees on them
     pose_error: float | None = None  # pixels of the training views: median standard error of a pose, where it is known
-    pseudo: tuple[View, ...] = ()  # pictures of models between the photos, trained on beside them (rtgs.runs.pseudo)
+    pseudo: tuple[View, ...] = ()  # pictures of models around the photos, trained on beside them (rtgs.runs.pseudo)
 
     @property
     def has_masks(self) -> bool:

@@ -23,7 +23,7 @@ TOTAL = 40
 
 
 def taught(visits: int = 3) -> Scene:
-    """Five photos and pseudo views from between them."""
+    """Five photos and pseudo views from around them."""
     cameras = [replace(look_at_origin(0.4 + 0.7 * index), name=f"pseudo view {index}") for index in range(visits)]
     views = tuple(View(camera, pattern(camera), None, None, camera.name) for camera in cameras)
     return replace(named(small_scene()), pseudo=views)

@@ -20,7 +20,7 @@ from rtgs.core.decisions import Decision
 from rtgs.core.errors import RtgsError
 from rtgs.methods.parts.feature_mirror import SH_IMAGE
 from rtgs.methods.parts.part import Frame, Part
-from rtgs.scenes.between import squared_apart
+from rtgs.scenes.around import squared_apart
 from rtgs.scenes.exposures import exposure_spread
 from rtgs.train.method import RenderedView
 from rtgs.train.parameters import ParameterGroup, Rate

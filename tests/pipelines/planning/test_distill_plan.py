@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
+from pipelines.cli.plan import plan_of_words
 from pipelines.planning.distilling import APART
 from pipelines.planning.graph import RunGraph, build_graph, shown_values
+from pipelines.planning.plan import steps_of_words
 from pipelines.steps.pseudo_views import PseudoParams
 from rtgs.config import compose
 from rtgs.core.errors import RtgsError
-from rtgs.workflow import topological
+from rtgs.workflow import Store, topological
+from rtgs.workflow.expectation import Expectation
 
 PLAIN = ("scene=toycar", "method=3dgs", "preset=smoke")
 GLASS = ("scene=ball_statue", "method=rtgs", "preset=smoke")
@@ -68,28 +72,50 @@ def test_an_ablation_is_of_teachers_too():
     assert found.distill[0].params.method.loss.dssim == 0
 
 
-def test_a_method_of_several_stages_is_taught_in_all_of_them_and_builds_on_one_mesh():
-    found = graph(*GLASS, "distill.teachers=2")
-    first, second, pseudo = found.distill
-    assert [step.name for step in found.training] == ["train_diffuse", "train_reflection", "train_transmittance"]
-    assert all(pseudo in step.upstream for step in found.training)
-    assert (first.params.stage, second.params.stage) == ("transmittance", "transmittance")
-    names = [[step.name for step in teacher.upstream] for teacher in (first, second)]
-    stages = ["train_diffuse_of_teacher_{}", "train_reflection_of_teacher_{}"]
-    for number, found_names in enumerate(names, 1):
-        assert found_names == ["import_scene", *(stage.format(number) for stage in stages), "extract_mesh"]
-    meshes = {
-        step for teacher in (first, second, found.training[-1]) for step in teacher.upstream if "mesh" in step.name
-    }
-    assert len(meshes) == 1
-    assert next(iter(meshes)) in found.evaluate.upstream
-    assert [step.name for step in next(iter(meshes)).upstream] == [
-        "import_scene",
-        "train_diffuse_of_teacher_1",
-        "train_reflection_of_teacher_1",
-    ]
-    every = [step.name for step in topological(found.targets)]
-    assert len({*every}) == len(every)
+def test_a_method_of_several_stages_is_refused():
+    with pytest.raises(RtgsError, match=r"rtgs trains in several stages \(diffuse, reflection, transmittance\)"):
+        graph(*GLASS, "distill.teachers=2")
+
+
+def test_pictures_of_another_program_are_taught_by_nobody():
+    words = ["scene=toycar", "method=external", "distill.teachers=2"]
+    assert not any(key.startswith("distill.") for key in shown_values(compose(words)[0]))
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("schedule={total:60}", "method={loss:{dssim:0.1}}"),
+        ("schedule.total=60", "++method.loss.dssim=0.1"),
+    ],
+)
+def test_however_words_are_written_they_reach_the_teachers(words: tuple[str, str]):
+    found = graph(*PLAIN, "distill.teachers=2", *words)
+    for step in (found.distill[0], found.training[0]):
+        assert step.params.schedule.total == 60
+        assert step.params.method.loss.dssim == 0.1
+
+
+def test_words_of_an_experiment_reach_the_teachers():
+    """Without its words for sweeps, which are no recipe."""
+    found = graph(*PLAIN, "experiment=time_quality", "distill.teachers=2")
+    alone = graph(*PLAIN, "experiment=time_quality", "seed=1000")
+    assert found.distill[0].params == replace(alone.training[0].params, watch=found.distill[0].params.watch)
+
+
+def test_a_preset_of_a_folder_of_ones_own_teaches_in_a_plan(tmp_path: Path, capsys):
+    (tmp_path / "preset").mkdir()
+    (tmp_path / "preset" / "mine.yaml").write_text("# @package _global_\ndefaults:\n  - quick\n  - _self_\n")
+    words = ["--config-dir", str(tmp_path), *PLAIN, "distill.teachers=2", "distill.preset=mine"]
+    assert plan_of_words(words) == 0
+    assert "teacher_2" in capsys.readouterr().out
+    assert any(step.name == "teacher_1" for step in steps_of_words(words))
+
+
+def test_a_teacher_is_expected_to_take_as_long_as_what_it_teaches(tmp_path: Path):
+    found = graph(*PLAIN, "distill.teachers=2")
+    expected = Expectation(Store(tmp_path))
+    assert expected.seconds(found.distill[0]) == expected.seconds(found.training[0]) > 0
 
 
 def test_a_judge_compares_the_taught_method():
@@ -126,6 +152,12 @@ def test_no_picture_is_refused(word: str):
 def test_high_is_not_for_a_method_that_it_was_not_measured_with():
     with pytest.raises(RtgsError, match=r"preset=high has nothing of method envgs: it is for .*preset=standard"):
         compose(["scene=toycar", "method=envgs", "preset=high"])
+
+
+@pytest.mark.parametrize("preset", ["paper_synthetic", "high"])
+def test_a_preset_that_has_nothing_of_the_method_teaches_nothing(preset: str):
+    with pytest.raises(RtgsError, match=f"distill.preset={preset} has nothing of method envgs"):
+        compose(["scene=toycar", "method=envgs", "preset=smoke", "distill.teachers=2", f"distill.preset={preset}"])
 
 
 def test_a_preset_that_is_none_is_told():

@@ -15,9 +15,11 @@ from pipelines.steps.training import read_summary
 from rtgs.evaluate.images import to_bytes
 from rtgs.runs.mixture import evaluated
 from rtgs.runs.pseudo import read_pseudo
-from rtgs.runs.training import CHECKPOINT_FOLDER, load_method, stage_params
+from rtgs.runs.training import CHECKPOINT_FOLDER, PSEUDO_VIEWS, load_method, stage_params
+from rtgs.scenes.around import cameras_around
 from rtgs.scenes.canonical import read_scene
 from rtgs.train.checkpoint import load_checkpoint
+from rtgs.train.seeds import generator_for
 from rtgs.workflow.manifest import Manifest
 from tests.pipelines.app_cases import QUICK, _in_root, capture, root  # noqa: F401  (fixtures)
 
@@ -54,6 +56,24 @@ def test_a_pseudo_view_is_the_mean_of_what_the_teachers_show(taught):
         assert int((shown - torch.from_numpy(to_bytes((first + second) / 2)).int()).abs().max()) == 0
 
 
+def test_cameras_are_those_of_the_seed(taught):
+    made = folders(taught)
+    scene = read_scene(made["import_scene"])
+    photos = [view.camera for view in scene.train]
+    for seed in (0, 1):
+        given = cameras_around(photos, scene.extent, 5, generator_for(seed, PSEUDO_VIEWS))
+        found = [view.camera for view in read_pseudo(made["pseudo_views"]).views[:5]]
+        assert (seed == 0) == all(torch.equal(a.center, b.center) for a, b in zip(given, found, strict=True))
+
+
+def test_no_more_pictures_are_made_than_are_visited(taught, root, capture):
+    words = [word for word in TAUGHT if not word.startswith("distill.most")]
+    assert main(["run", f"scene.path={capture}", *words, "name=all"]) == 0
+    made = folders(root / "runs" / "all")
+    views = read_pseudo(made["pseudo_views"]).views
+    assert len({view.name for view in views}) == len(views) == 2 * len(read_scene(made["import_scene"]).train)
+
+
 def test_the_run_visits_them_beside_the_photos(taught):
     made = folders(taught)
     scene = read_scene(made["import_scene"])
@@ -73,7 +93,7 @@ def test_what_the_teachers_cost_is_in_the_run_and_in_its_table(taught):
         assert getattr(student, key) > paid > 0
     assert pseudo.spent.cpu > sum(each.cpu_seconds for each in teachers)
     assert student.cpu_seconds > pseudo.spent.cpu
-    assert student.peak_memory_mb >= max(each.peak_memory_mb for each in teachers)
+    assert student.peak_memory_mb >= pseudo.peak_memory_mb == max(each.peak_memory_mb for each in teachers)
     facts = json.loads((taught / "metrics.json").read_text())["facts"]
     assert facts["train_cpu_seconds"] == student.cpu_seconds
     assert facts["steps"] == student.steps == 12

@@ -1,4 +1,8 @@
-"""Cameras between those of the photos: where a model is asked what it knows of places that no photo was taken from."""
+"""Cameras around those of the photos: where a model is asked what it knows of places that no photo was taken from.
+
+Between the photos alone is not enough: a model that learns from there is free to hang veils before all other places
+(docs/lab/training.md, "Taught by three").
+"""
 
 from __future__ import annotations
 
@@ -6,14 +10,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 from torch import Generator, Tensor
 
 from rtgs.core.cameras import Camera
 from rtgs.core.errors import RtgsError
 
 NEAREST = 4  # cameras that one is paired with
-INNER = (0.25, 0.75)  # shares of the way between the two: nearer to a photo, the photo itself tells more
+WAY = (-0.25, 1.25)  # shares of the way from one to the other, also before and beyond
+ASIDE = 0.2  # scene extents off that way, standard deviation along each axis
 
 
 def squared_apart(camera: Camera, others: Sequence[Camera], extent: float) -> Tensor:
@@ -24,8 +29,8 @@ def squared_apart(camera: Camera, others: Sequence[Camera], extent: float) -> Te
     return ((centers - camera.center) / extent).square().sum(1) + angles.square()
 
 
-def cameras_between(cameras: Sequence[Camera], extent: float, count: int, generator: Generator) -> tuple[Camera, ...]:
-    """Cameras on the way from each camera to one of those nearest to it.
+def cameras_around(cameras: Sequence[Camera], extent: float, count: int, generator: Generator) -> tuple[Camera, ...]:
+    """Cameras by the way from each camera to one of those nearest to it.
 
     Parameters
     ----------
@@ -41,7 +46,8 @@ def cameras_between(cameras: Sequence[Camera], extent: float, count: int, genera
     Returns
     -------
     tuple of Camera
-        With the lens and size of the first of the two; centres are on the straight line, rotations on the shortest arc.
+        With the lens and size of the first of the two; rotations are on the shortest arc, also before and beyond it,
+        centres near the straight line.
 
     Raises
     ------
@@ -49,7 +55,7 @@ def cameras_between(cameras: Sequence[Camera], extent: float, count: int, genera
         Fewer than two cameras.
     """
     if len(cameras) < 2:
-        raise RtgsError(f"cameras between photos need two photos, there is {len(cameras)}: set distill.teachers=0")
+        raise RtgsError(f"cameras around photos need two photos, there is {len(cameras)}: set distill.teachers=0")
     apart = torch.stack([squared_apart(camera, cameras, extent) for camera in cameras])
     apart.fill_diagonal_(torch.inf)
     near = apart.argsort(1)[:, : min(NEAREST, len(cameras) - 1)]
@@ -58,14 +64,17 @@ def cameras_between(cameras: Sequence[Camera], extent: float, count: int, genera
     for index in range(count):
         first = int(order[index % len(cameras)])
         second = int(near[first, int(torch.randint(near.shape[1], (), generator=generator))])
-        share = INNER[0] + (INNER[1] - INNER[0]) * float(torch.rand((), generator=generator, dtype=torch.float64))
-        found.append(_between(cameras[first], cameras[second], share, f"pseudo view {index}"))
+        share = WAY[0] + (WAY[1] - WAY[0]) * float(torch.rand((), generator=generator, dtype=torch.float64))
+        aside = ASIDE * extent * torch.randn(3, generator=generator, dtype=torch.float64)
+        camera = _on_the_way(cameras[first], cameras[second], share)
+        center = camera.center + aside
+        found.append(replace(camera, translation=-camera.rotation @ center, name=f"pseudo view {index}"))
     return tuple(found)
 
 
-def _between(first: Camera, second: Camera, share: float, name: str) -> Camera:
+def _on_the_way(first: Camera, second: Camera, share: float) -> Camera:
     """``share`` of the way from the first to the second."""
-    ends = Rotation.from_matrix(torch.stack([first.rotation, second.rotation]).numpy())
-    rotation: Tensor = torch.from_numpy(Slerp([0.0, 1.0], ends)(share).as_matrix())
+    turn = Rotation.from_matrix((second.rotation @ first.rotation.T).numpy())
+    rotation = torch.from_numpy(Rotation.from_rotvec(share * turn.as_rotvec()).as_matrix()) @ first.rotation
     center = (1 - share) * first.center + share * second.center
-    return replace(first, rotation=rotation, translation=-rotation @ center, name=name)
+    return replace(first, rotation=rotation, translation=-rotation @ center)
