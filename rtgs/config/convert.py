@@ -26,8 +26,6 @@ from rtgs.methods import find_method, own_methods
 from rtgs.methods.settings import MethodSettings
 from rtgs.methods.spec import FEATURES
 
-HIGH = "high"  # the preset of a method and the models that teach it
-
 
 def hide_credentials(composed: DictConfig) -> None:
     """From now on :func:`rtgs.core.credentials.redact` finds the secrets in the addresses of this config."""
@@ -104,8 +102,7 @@ def with_own(method: MethodSettings) -> MethodSettings:
 
 
 def _refuse_preset_of_others(config: RunConfig, choices: Choices, key: str = "preset") -> None:
-    """``preset=paper_<kind>`` is what authors publish for scenes of a kind, and ``high`` is for methods that it was
-    measured to pay with: a method without a file for it has none.
+    """``preset=paper_<kind>`` is what authors publish for scenes of a kind: a method without a file for it has none.
 
     Raises:
         RtgsError: the method has none.
@@ -114,13 +111,15 @@ def _refuse_preset_of_others(config: RunConfig, choices: Choices, key: str = "pr
     if pictures_only(config) or _has_preset(method, preset):
         return
     fit = [spec.name for spec in own_methods() if _has_preset(spec.name, preset)]
-    instead = "preset=standard is there for all" if preset == HIGH else "preset=paper is its published schedule"
-    raise RtgsError(f"config: {key}={preset} has nothing of method {method}: it is for {', '.join(fit)}; {instead}")
+    raise RtgsError(
+        f"config: {key}={preset} has nothing of method {method}: it is for {', '.join(fit)}; preset=paper is its "
+        "published schedule"
+    )
 
 
 def _has_preset(method: str, preset: str) -> bool:
     """``method`` is the name of its file. Presets of a folder of one's own hold for all."""
-    shipped = (preset.startswith("paper_") or preset == HIGH) and preset in choices_of("preset")
+    shipped = preset.startswith("paper_") and preset in choices_of("preset")
     return not shipped or f"{preset}_{method}" in (*choices_of("method_in_preset"), *more_choices("method_in_preset"))
 
 

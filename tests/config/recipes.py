@@ -15,7 +15,6 @@ import yaml
 
 from pipelines.planning.graph import build_graph
 from pipelines.planning.inspection import Inspections
-from rtgs.config.convert import HIGH
 from rtgs.config.locate import choices_of, conf_dir
 from rtgs.config.sweep import ComposedJob, compose_jobs
 from rtgs.methods import find_method
@@ -92,14 +91,9 @@ def fitting(method: str, preset: str = "") -> list[str]:
 
 
 def presets_of(method: str) -> list[str]:
-    """Every preset but those that the method has no file for and needs one."""
+    """Every preset but those of scenes of a kind for which the method has no schedule."""
     own = choices_of("method_in_preset")
-    return [name for name in choices_of("preset") if not needs_file(name) or f"{name}_{method}" in own]
-
-
-def needs_file(preset: str) -> bool:
-    """Whether a preset is only for methods that have a file for it: of scenes of a kind, or measured to pay."""
-    return preset == HIGH or preset.startswith("paper_")
+    return [name for name in choices_of("preset") if not name.startswith("paper_") or f"{name}_{method}" in own]
 
 
 def flat_leaves(values: dict, *before: str) -> Iterator[tuple[str, object]]:
@@ -123,7 +117,7 @@ def recipes(method: str) -> Iterator[tuple[str, list[str]]]:
     with patch("rtgs.pretrained.weights.weight_folders", tuple):  # a machine without networks
         idle = [name for name in fitting(method) if name not in fitting(method, "paper")]
         chosen = [("paper", fitting(method, "paper")), ("smoke,quick,standard", ["none"])]
-        chosen += [(preset, ["none"]) for preset in presets_of(method) if needs_file(preset)]
+        chosen += [(preset, ["none"]) for preset in presets_of(method) if preset.startswith("paper_")]
         for presets, ablations in [*chosen, ("quick", idle)] if idle else chosen:
             files = [f"method={method}", f"preset={presets}", f"ablation={','.join(ablations)}"]
             for job in _jobs(["scene=ball_statue", *files, f"scene.path={paths}"]):

@@ -52,7 +52,6 @@ def presets() -> Iterator[tuple[str, list[str]]]:
     yield "preset/quick", ["short_presets", "quick_recipe"]
     yield "preset/smoke", ["short_presets", "quick_recipe", "preset/quick"]
     yield "preset/standard", ["short_presets"]
-    yield "preset/high", ["short_presets", "preset/standard"]
 
 
 def layers(method: str, files: list[str]) -> dict[str, object]:

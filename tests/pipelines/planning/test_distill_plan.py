@@ -13,6 +13,7 @@ from pipelines.planning.graph import RunGraph, build_graph, shown_values
 from pipelines.planning.plan import steps_of_words
 from pipelines.steps.pseudo_views import PseudoParams
 from rtgs.config import compose
+from rtgs.config.opened import with_configs
 from rtgs.core.errors import RtgsError
 from rtgs.workflow import Store, topological
 from rtgs.workflow.expectation import Expectation
@@ -96,11 +97,12 @@ def test_however_words_are_written_they_reach_the_teachers(words: tuple[str, str
         assert step.params.method.loss.dssim == 0.1
 
 
-def test_words_of_an_experiment_reach_the_teachers():
-    """Without its words for sweeps, which are no recipe."""
-    found = graph(*PLAIN, "experiment=time_quality", "distill.teachers=2")
-    alone = graph(*PLAIN, "experiment=time_quality", "seed=1000")
-    assert found.distill[0].params == replace(alone.training[0].params, watch=found.distill[0].params.watch)
+def test_an_experiment_is_of_teachers_too(tmp_path: Path):
+    (tmp_path / "experiment").mkdir()
+    (tmp_path / "experiment" / "mine.yaml").write_text("# @package _global_\nmethod:\n  loss:\n    dssim: 0.05\n")
+    with with_configs(tmp_path):
+        found = graph(*PLAIN, "experiment=mine", "distill.teachers=2")
+    assert found.distill[0].params.method.loss.dssim == found.training[0].params.method.loss.dssim == 0.05
 
 
 def test_a_preset_of_a_folder_of_ones_own_teaches_in_a_plan(tmp_path: Path, capsys):
@@ -127,16 +129,6 @@ def test_a_judge_compares_the_taught_method():
     assert found.distill[0].params.method.appearance == until[0].params.method.appearance
 
 
-def test_high_is_standard_taught_by_three_of_quick():
-    for method in ("2dgs", "3dgs"):
-        words = ("scene=toycar", f"method={method}")
-        found, standard = graph(*words, "preset=high"), graph(*words, "preset=standard")
-        quick = graph(*words, "preset=quick", "scene.long_side=800", "seed=3000")
-        assert found.training[0].params == standard.training[0].params
-        assert found.distill[2].params == quick.training[0].params
-        assert len(found.distill) == 4
-
-
 @pytest.mark.parametrize("teachers", [-1, 1, 10])
 def test_a_number_of_teachers_that_teaches_nothing_is_refused(teachers: int):
     with pytest.raises(RtgsError, match=r"distill\.teachers"):
@@ -149,15 +141,9 @@ def test_no_picture_is_refused(word: str):
         compose([*PLAIN, word])
 
 
-def test_high_is_not_for_a_method_that_it_was_not_measured_with():
-    with pytest.raises(RtgsError, match=r"preset=high has nothing of method envgs: it is for .*preset=standard"):
-        compose(["scene=toycar", "method=envgs", "preset=high"])
-
-
-@pytest.mark.parametrize("preset", ["paper_synthetic", "high"])
-def test_a_preset_that_has_nothing_of_the_method_teaches_nothing(preset: str):
-    with pytest.raises(RtgsError, match=f"distill.preset={preset} has nothing of method envgs"):
-        compose(["scene=toycar", "method=envgs", "preset=smoke", "distill.teachers=2", f"distill.preset={preset}"])
+def test_a_preset_that_has_nothing_of_the_method_teaches_nothing():
+    with pytest.raises(RtgsError, match=r"distill\.preset=paper_synthetic has nothing of method 3dgs"):
+        compose([*PLAIN, "distill.teachers=2", "distill.preset=paper_synthetic"])
 
 
 def test_a_preset_that_is_none_is_told():
