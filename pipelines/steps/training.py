@@ -81,8 +81,7 @@ def train_stage(params: StageParams, context: StepContext, object_mesh: ObjectMe
         spent=None if pseudo is None else pseudo.spent,
     )
     summary = trainer.run()
-    if pseudo is not None:
-        summary = replace(summary, peak_memory_mb=max(summary.peak_memory_mb, pseudo.peak_memory_mb))
+    summary = summary if pseudo is None else _of_all(summary, pseudo)
     newest = max(checkpoints.glob("step_*"))
     shutil.copytree(newest, context.out / CHECKPOINT_FOLDER)
     if object_mesh is not None:
@@ -106,6 +105,11 @@ def _pseudo_views(context: StepContext) -> PseudoViews | None:
 
     folder = context.inputs.get(PSEUDO_VIEWS)
     return None if folder is None else read_pseudo(folder)
+
+
+def _of_all(summary: TrainSummary, pseudo: PseudoViews) -> TrainSummary:
+    """The summary of a taught training: its times count those of its teachers already, its peak is that of any."""
+    return replace(summary, peak_memory_mb=max(summary.peak_memory_mb, pseudo.peak_memory_mb))
 
 
 def _start_from_stage_before(context: StepContext, checkpoints: Path) -> None:

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 from pipelines.cli.plan import plan_of_words
 from pipelines.planning.distilling import APART
@@ -78,8 +79,10 @@ def test_a_method_of_several_stages_is_refused():
         graph(*GLASS, "distill.teachers=2")
 
 
-def test_pictures_of_another_program_are_taught_by_nobody():
-    words = ["scene=toycar", "method=external", "distill.teachers=2"]
+def test_pictures_of_another_program_are_taught_by_nobody(tmp_path: Path):
+    Image.new("RGB", (4, 4)).save(tmp_path / "view.png")
+    words = ["scene=toycar", "method=external", "distill.teachers=2", f"external.renders={tmp_path}"]
+    assert graph(*words).distill == ()
     assert not any(key.startswith("distill.") for key in shown_values(compose(words)[0]))
 
 

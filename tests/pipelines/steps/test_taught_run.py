@@ -5,13 +5,14 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
 from pipelines.cli.main import main
-from pipelines.steps.training import read_summary
+from pipelines.steps.training import _of_all, read_summary
 from rtgs.evaluate.images import to_bytes
 from rtgs.runs.mixture import evaluated
 from rtgs.runs.pseudo import read_pseudo
@@ -97,6 +98,14 @@ def test_what_the_teachers_cost_is_in_the_run_and_in_its_table(taught):
     facts = json.loads((taught / "metrics.json").read_text())["facts"]
     assert facts["train_cpu_seconds"] == student.cpu_seconds
     assert facts["steps"] == student.steps == 12
+
+
+def test_the_peak_is_that_of_the_training_that_took_most(taught):
+    made = folders(taught)
+    student, pseudo = read_summary(made["train_diffuse"]), read_pseudo(made["pseudo_views"])
+    for peak in (student.peak_memory_mb - 100, student.peak_memory_mb + 100):
+        found = _of_all(student, replace(pseudo, peak_memory_mb=peak))
+        assert found == replace(student, peak_memory_mb=max(peak, student.peak_memory_mb))
 
 
 def test_the_report_names_the_steps_and_the_words(taught):
