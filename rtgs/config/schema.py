@@ -131,7 +131,7 @@ class JudgeConfig:
 
 @dataclass(frozen=True)
 class DistillConfig:
-    """Models with other seeds teach the one of the run what they agree on around the photos (docs/training.md)."""
+    """Models with other seeds teach the one of the run what they agree on around the photos (docs/distill.md)."""
 
     teachers: int = 0
     """How many are trained before it, each with a seed of its own: seed + 1000, seed + 2000 and so on. 0: none."""

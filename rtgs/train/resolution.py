@@ -122,6 +122,7 @@ class GrowingViews:
         if factor != self._factor:
             self._shrunk.clear()
             self._factor = factor
-        if index not in self._shrunk:
-            self._shrunk[index] = shrunk(self._views[index], factor)
-        return self._shrunk[index]
+        view = self._views[index]
+        if id(view) not in self._shrunk:  # one that is listed several times is shrunk once
+            self._shrunk[id(view)] = shrunk(view, factor)
+        return self._shrunk[id(view)]

@@ -16,6 +16,7 @@ from rtgs.scenes.scene import Scene, View
 from rtgs.train.checkpoint import CheckpointError, scene_digest
 from rtgs.train.clock import ElapsedTime
 from rtgs.train.method import Mode
+from rtgs.train.resolution import GrowingViews
 from rtgs.train.seeds import generator_for
 from rtgs.train.trainer import Trainer
 
@@ -62,6 +63,18 @@ def test_a_picture_that_is_listed_twice_is_visited_twice():
     scene = taught(1)
     visited = visits_of(trainer(replace(scene, pseudo=scene.pseudo * 3)))
     assert visited[:8].count("pseudo view 0") == 3
+
+
+def test_a_picture_that_is_listed_twice_is_shrunk_once():
+    view = replace(taught(1).pseudo[0], image=torch.rand(3, 128, 160))
+    view = replace(view, camera=view.camera.resized(160, 128))
+    coarse = small_schedule(TOTAL, coarse=2, coarse_until=1)
+    growing = GrowingViews((view, view, replace(view, name="another")), coarse)
+    assert growing.factor(0) == 2
+    first, again, other = (growing.at(index, 0) for index in range(3))
+    assert first is again
+    assert other.name == "another"
+    assert first.image.shape == other.image.shape == (3, 64, 80)
 
 
 def test_what_the_models_cost_counts_once_also_after_a_kill(tmp_path: Path):
