@@ -1,7 +1,6 @@
 """Cameras around those of the photos: where a model is asked what it knows of places that no photo was taken from.
 
-Between the photos alone is not enough: a model that learns from there is free to hang veils before all other places
-(docs/lab/training.md, "Taught by three").
+Between the photos alone a model is free to hang veils before other places (docs/lab/training.md, "Taught by three").
 """
 
 from __future__ import annotations

@@ -94,5 +94,5 @@ def test_a_lens_that_is_none_is_refused(tmp_path: Path):
     content = json.loads((tmp_path / RECORD).read_text())
     content["views"][2]["fx"] = -3.0
     (tmp_path / RECORD).write_text(json.dumps(content))
-    with pytest.raises(RtgsError):
+    with pytest.raises(RtgsError, match="cannot be read as a record"):
         read_pseudo(tmp_path)
