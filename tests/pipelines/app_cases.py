@@ -29,6 +29,12 @@ NAMED = f"-{overridden(QUICK)}"
 """What they add to a run's name."""
 
 
+def folders(run: Path) -> dict[str, Path]:
+    """The artifact of each step of a run."""
+    steps = json.loads((run / "run.json").read_text())["steps"]
+    return {name: run.parents[1] / "store" / name / key[:2] / key for name, key in steps.items()}
+
+
 def pose(index: int) -> list[list[float]]:
     """Camera to world (OpenGL axes) on a ring around the origin, looking at it."""
     angle = 2 * math.pi * index / VIEWS

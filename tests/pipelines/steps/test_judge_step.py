@@ -36,17 +36,11 @@ from rtgs.scenes.scene import Scene
 from rtgs.train.checkpoint import load_checkpoint
 from rtgs.train.method import Mode
 from rtgs.workflow.manifest import Manifest
-from tests.pipelines.app_cases import QUICK, _in_root, capture, root  # noqa: F401  (fixtures)
+from tests.pipelines.app_cases import QUICK, _in_root, capture, folders, root  # noqa: F401  (fixtures)
 from tests.pipelines.steps.test_transmittance_stage import TINY, write_capture
 
 JUDGED = ("judge=photos", *QUICK)
 SPOILT_GLASS = ("method.transmittance.rate_gain=100000.0", "method.transmittance.wall.index=2.5")
-
-
-def folders(run: Path) -> dict[str, Path]:
-    """The artifact of each step of a run."""
-    steps = json.loads((run / "run.json").read_text())["steps"]
-    return {name: run.parents[1] / "store" / name / key[:2] / key for name, key in steps.items()}
 
 
 def plain_image(place: Path, scene: Scene, camera: Camera) -> torch.Tensor:

@@ -22,15 +22,9 @@ from rtgs.scenes.canonical import read_scene
 from rtgs.train.checkpoint import load_checkpoint
 from rtgs.train.seeds import generator_for
 from rtgs.workflow.manifest import Manifest
-from tests.pipelines.app_cases import QUICK, _in_root, capture, root  # noqa: F401  (fixtures)
+from tests.pipelines.app_cases import QUICK, _in_root, capture, folders, root  # noqa: F401  (fixtures)
 
 TAUGHT = ("method=2dgs", "distill.teachers=2", "distill.views=2", "distill.most=5", *QUICK)
-
-
-def folders(run: Path) -> dict[str, Path]:
-    """The artifact of each step of a run."""
-    steps = json.loads((run / "run.json").read_text())["steps"]
-    return {name: run.parents[1] / "store" / name / key[:2] / key for name, key in steps.items()}
 
 
 @pytest.fixture(scope="module")
