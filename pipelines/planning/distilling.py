@@ -6,14 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from pipelines.steps import pseudo_views
-from rtgs.config.compose import compose_teacher
+from rtgs.config.compose import compose_other
 from rtgs.config.schema import Choices, RunConfig
 from rtgs.core.errors import RtgsError
 from rtgs.methods import find_method
 from rtgs.train.settings import WatchSettings
 from rtgs.workflow import Step
-
-APART = 1000  # between the seeds of a run and of its teachers: those of a sweep over seeds stay apart
 
 
 @dataclass(frozen=True)
@@ -43,11 +41,10 @@ def distilling_of(
     asked = config.distill
     if asked.teachers == 0 or find_method(config.method.name).elsewhere:
         return Distilling()
-    method, schedule = compose_teacher(asked.preset, choices)
+    method, schedule = compose_other(asked.preset, choices)
     teachers = []
     for number in range(1, asked.teachers + 1):
-        seed = config.seed + APART * number
-        own = replace(config, method=method, schedule=schedule, seed=seed, watch=WatchSettings())
+        own = replace(config, method=method, schedule=schedule, seed=config.other_seed(number), watch=WatchSettings())
         only, *more = training(own)
         if more:
             names = ", ".join(step.params.stage for step in (only, *more))

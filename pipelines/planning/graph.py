@@ -1,4 +1,4 @@
-"""The graph of a run: (sfm, masks, normals ->) import -> a step per stage (+ teachers, mesh, judge) -> results.
+"""The graph of a run: (sfm, masks, normals ->) import -> a step per stage (+ others, mesh, judge) -> results.
 
 Pure: from a config to steps with parameters; nothing runs here. Each step is given only what it reads.
 """
@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 
 from pipelines.planning.distilling import distilling_of
+from pipelines.planning.ensemble import members_of
 from pipelines.planning.inspection import Inspections
 from pipelines.planning.judge import (
     Opponent,
@@ -39,7 +40,7 @@ from pipelines.steps import (
     synthesize,
     train,
 )
-from rtgs.config.convert import judged, pictures_only
+from rtgs.config.convert import judged, models_of, pictures_only
 from rtgs.config.schema import Choices, RunConfig
 from rtgs.core.decisions import Decision
 from rtgs.core.recipe import flatten
@@ -69,7 +70,7 @@ KINDS: tuple[StepKind, ...] = (
 """Every kind of step there is; the guard against forgotten version bumps goes through them."""
 
 _NOT_SHOWN = ("paths.", "tracking.", "table.", "name", "threads", "view", "scene.path", "method.paper_schedule.")
-_OF_TRAINING = ("method.", "schedule.", "mesh.", "seed", "ablation.", "distill.")
+_OF_TRAINING = ("method.", "schedule.", "mesh.", "seed", "ablation.", "distill.", "ensemble.")
 
 
 @dataclass(frozen=True)
@@ -84,6 +85,7 @@ class RunGraph:
     mesh: Step | None = None
     judge: tuple[Step, ...] = ()  # the plain method's training, the judge, the rest of that training
     distill: tuple[Step, ...] = ()  # teachers' trainings, and what they show around the photos
+    members: tuple[Step, ...] = ()  # trainings of an ensemble's further models
     skipped: tuple[Decision, ...] = ()  # ``what`` is the name of the step
     unread: tuple[Decision, ...] = ()  # what the settings ask for and no step does
     moved: tuple[Decision, ...] = ()  # what happens at another time than in other scenes
@@ -114,17 +116,19 @@ def build_graph(config: RunConfig, choices: Choices, inspections: Inspections | 
     train_on = partial(_training, prepared=prepared, transparent=transparency.present, networks=networks)
     distilling = distilling_of(config, choices, scene, lambda own: train_on(own)[0])
     training, object_mesh = train_on(config, opponent=opponent, pseudo=distilling.pseudo)
+    members = members_of(config, choices, lambda own: _with_mesh(*train_on(own)))
     judging = judging_of(config, opponent, scene, training, networks)
     judge_steps = () if judging is None else judging.steps
     if judging is not None:
         training += rest_of(training[-1], judging.judge, networks)
-    rendered = _rendered(config, scene, *training, *judge_steps)
+    rendered = _rendered(config, scene, *training, *judge_steps, *members.last)
     measured = evaluate.STEP.step(
         evaluate.EvaluateParams(config.evaluation, row_label(config, choices), choices.preset),
         scene,
         *training,
         *(() if object_mesh is None else (object_mesh,)),
         *judge_steps,
+        *members.steps,
         rendered,
         tools=_pretrained() if config.evaluation.lpips else (),
     )
@@ -135,11 +139,14 @@ def build_graph(config: RunConfig, choices: Choices, inspections: Inspections | 
     made = (rendered, measured) if mesh is None else (mesh, rendered, measured)
     unread = find_method(config.method.name).unread_losses(config.method)
     late = (*why_judged_late(config, opponent), *why_photos_unseen(config))
-    moved = (*_in_this_scene(config, transparency.present), *late)
+    moved = (*_in_this_scene(config, transparency.present), *late, *members.noted)
     params = _report_params(config, choices, skipped, (*unread, *moved))
-    page = report.STEP.step(params, *prepared.steps, scene, *distilling.steps, *training, *judge_steps, *made)
-    taught = distilling.steps
-    return RunGraph(scene, training, rendered, measured, page, mesh, judge_steps, taught, skipped, unread, moved)
+    others = (*judge_steps, *members.steps)
+    page = report.STEP.step(params, *prepared.steps, scene, *distilling.steps, *training, *others, *made)
+    taught, further = distilling.steps, members.steps
+    return RunGraph(
+        scene, training, rendered, measured, page, mesh, judge_steps, taught, further, skipped, unread, moved
+    )
 
 
 def _rendered(config: RunConfig, scene: Step, *upstream: Step) -> Step:
@@ -216,6 +223,14 @@ def _training(
     return tuple(steps), object_mesh
 
 
+def _with_mesh(training: tuple[Step, ...], object_mesh: Step | None) -> tuple[Step, ...]:
+    """All steps of a training, the object mesh before the first that waits for it."""
+    if object_mesh is None:
+        return training
+    at = next(index for index, step in enumerate(training) if object_mesh in step.upstream)
+    return (*training[:at], object_mesh, *training[at:])
+
+
 def _through_glass(config: RunConfig, transparent: bool) -> bool:
     """Whether a stage for the transparent object is asked for, and there is one."""
     return transparent and find_method(config.method.name).object_stage(config.method) is not None
@@ -263,7 +278,8 @@ def row_label(config: RunConfig, choices: Choices) -> str:
     """With what a judge does to it: such rows are not the pure method's. Of other programs' pictures their name."""
     if pictures_only(config):
         return config.external.name or method_label(choices)
-    return f"{method_label(choices)}, judged" if judged(config) else method_label(choices)
+    label = f"{method_label(choices)}, judged" if judged(config) else method_label(choices)
+    return label if (count := models_of(config)) == 1 else f"{label}, mean of {count}"
 
 
 def _report_params(
@@ -289,6 +305,7 @@ def shown_values(config: RunConfig) -> dict[str, object]:
     if not config.judge.plain and not config.scene.hold_out:  # pages of runs without a judge stay as they were
         hidden = (*hidden, "judge.", "scene.hold_out")
     hidden = hidden if config.distill.teachers else (*hidden, "distill.")
+    hidden = hidden if models_of(config) > 1 else (*hidden, "ensemble.")
     return {key: value for key, value in flatten(asdict(config)).items() if not key.startswith(hidden)}
 
 

@@ -12,7 +12,7 @@ from rtgs.core.files import sha256_of
 from rtgs.core.records import read_record, write_json
 from rtgs.methods.spec import RASTERIZED
 from rtgs.runs.record import RunRecord
-from rtgs.runs.shown import NEEDED
+from rtgs.runs.shown import needed_steps
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -270,4 +270,4 @@ def _trained(run: ShownRun) -> dict[str, str]:
     """What the model was made of: another training of the same name is another model."""
     record = RunRecord.read(run.folder)
     assert record is not None  # open_run has read it
-    return {name: key for name, key in record.steps.items() if name.startswith(NEEDED)}
+    return needed_steps(record)

@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pipelines.publishing.results import evaluation_of, was_trained
+from rtgs.config.convert import models_of
 from rtgs.config.schema import RunConfig
 from rtgs.core.errors import RtgsError
 from rtgs.core.files import whole_file
-from rtgs.evaluate.curves import Look, QualityCurve, comma_separated, markdown, with_pause
+from rtgs.evaluate.curves import Look, QualityCurve, comma_separated, markdown, with_others, with_pause
 from rtgs.runs.training import read_history, stage_params
 from rtgs.train.watch import CPU_SECONDS, PSNR, PSNR_MASKED
 from rtgs.workflow import StepResult
@@ -49,7 +50,8 @@ def write_time_quality(folder: Path, runs: Sequence[tuple[RunConfig, Sequence[St
 
 def _curve(config: RunConfig, results: Sequence[StepResult]) -> QualityCurve:
     """The looks of a run over all of its stages, with the mesh that a stage waited for."""
-    facts = evaluation_of(results).facts
+    table = evaluation_of(results)
+    facts = table.facts
     stages = sorted(
         (result for result in results if result.step.name.startswith("train_")),
         key=lambda result: stage_params(result.folder).until,
@@ -60,6 +62,9 @@ def _curve(config: RunConfig, results: Sequence[StepResult]) -> QualityCurve:
     for stage in stages:
         if (mesh := _awaited_mesh(stage, results)) is not None:
             looks = with_pause(looks, stage_params(stage.folder).from_step, _seconds(mesh))
+    psnr, cpu = table.mean("psnr"), facts.train_cpu_seconds
+    if models_of(config) > 1 and psnr is not None and cpu is not None:
+        looks = with_others(looks, Look(looks[-1].steps, cpu, psnr, table.mean("psnr_masked")))
     return QualityCurve(facts.scene, facts.method, facts.preset, config.seed, tuple(looks))
 
 

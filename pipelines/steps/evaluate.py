@@ -18,7 +18,7 @@ from rtgs.evaluate.judgement import JudgeRecord
 from rtgs.evaluate.networks import check_networks
 from rtgs.evaluate.settings import EvaluationSettings
 from rtgs.mesh.record import MeshRecord
-from rtgs.runs.mixture import TRAININGS, plain_training
+from rtgs.runs.mixture import TRAININGS, member_name, members_of, plain_training
 from rtgs.runs.training import has_training, last_training
 from rtgs.workflow import StepContext, StepKind
 from rtgs.workflow.manifest import Manifest
@@ -111,12 +111,12 @@ def evaluate(params: EvaluateParams, context: StepContext) -> None:
 
 def _summary(inputs: Mapping[str, Path]) -> TrainSummary | None:
     """Of the training with the mesh that it waited for; where a judge was asked, with what the plain method cost, and
-    the surfels of what is shown. None: the pictures are another program's."""
+    the surfels of what is shown; of an ensemble, of all its models. None: the pictures are another program's."""
     if not has_training(inputs):
         return None
-    full = _with_mesh(read_summary(last_training(inputs)), inputs)
+    full = _with_mesh(read_summary(last_training(inputs)), inputs.get(MESH_STEP))
     if JUDGE.name not in inputs:
-        return full
+        return _of_all(full, inputs)
     plain, record = read_summary(plain_training(inputs)), JudgeRecord.read(inputs[JUDGE.name])
     peaks = (read_summary(folder).peak_memory_mb for name, folder in inputs.items() if name.startswith(TRAININGS))
     return replace(
@@ -129,9 +129,24 @@ def _summary(inputs: Mapping[str, Path]) -> TrainSummary | None:
     )
 
 
-def _with_mesh(summary: TrainSummary, inputs: Mapping[str, Path]) -> TrainSummary:
+def _of_all(own: TrainSummary, inputs: Mapping[str, Path]) -> TrainSummary:
+    """What all models of an ensemble cost, trained one after the other, and their surfels together."""
+    models = [own]
+    for number in range(1, len(members_of(inputs)) + 1):
+        mesh = inputs.get(member_name(number, MESH_STEP))
+        models.append(_with_mesh(read_summary(inputs[member_name(number)]), mesh))
+    return replace(
+        own,
+        seconds=sum(each.seconds for each in models),
+        cpu_seconds=sum(each.cpu_seconds for each in models),
+        peak_memory_mb=max(each.peak_memory_mb for each in models),
+        surfels=sum(each.surfels for each in models),
+    )
+
+
+def _with_mesh(summary: TrainSummary, mesh: Path | None) -> TrainSummary:
     """The times with those of the transparent object's mesh: the third stage cannot begin before it is made."""
-    made = Manifest.read(inputs[MESH_STEP]) if MESH_STEP in inputs else None
+    made = None if mesh is None else Manifest.read(mesh)
     if made is None:
         return summary
     cpu = made.duration if made.cpu_seconds is None else made.cpu_seconds

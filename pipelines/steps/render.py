@@ -38,7 +38,7 @@ PREVIEW_RATE = 8  # frames a second
 PREVIEW_BYTES = 400_000
 ENVIRONMENT = "environment"  # folder of pictures of the far light, of methods that have one
 _ENVIRONMENT_SIDE = 128  # of its cubemap; the panorama is 512 x 256
-FULL = "image_full"  # where the judge kept the plain method: of the full method alone
+FULL = "image_full"  # where the picture is not of the run's model alone: that model's
 
 
 @dataclass(frozen=True)
@@ -100,12 +100,13 @@ def render(params: RenderParams, context: StepContext) -> None:
 
     Writes ``images/<stem>.png`` (8 bit, stems of ``unique_stems``), ``views/<stem>.safetensors`` (float32: image (3,
     H, W) not clamped, depth (H, W) z-depth divided by alpha in world units, normal (3, H, W) world frame where the
-    method has one, alpha (H, W); with a third stage also ``image_given_masks``; where a judge kept the plain method
-    ``image_full``, the full one's image: maps and layers are the full method's; with ``refine_steps``, where poses were
-    learned or ``refine_all`` is on, also ``image_refined_pose``), ``coverage.safetensors`` (by view name (H, W) int16:
-    training views that show what the pixel shows), ``preview.webp`` (a way round the scene that plays for ever, small)
-    and ``render.json`` (:class:`RenderTimes`). ``params.supersample`` is of the other images. Of methods with a far
-    light also ``environment/`` (:func:`rtgs.light.pictures.save_environment`; up is that of the cameras).
+    method has one, alpha (H, W); with a third stage also ``image_given_masks``; of an ensemble, and where a judge kept
+    the plain method, ``image_full``, which is of the run's model alone, as all maps and layers are; with
+    ``refine_steps``, where poses were learned or ``refine_all`` is on, also ``image_refined_pose``),
+    ``coverage.safetensors`` (by view name (H, W) int16: training views that show what the pixel shows),
+    ``preview.webp`` (a way round the scene that plays for ever, small) and ``render.json`` (:class:`RenderTimes`).
+    ``params.supersample`` is of the other images. Of methods with a far light also ``environment/``
+    (:func:`rtgs.light.pictures.save_environment`; up is that of the cameras).
     """
     import torch
     from safetensors.torch import save_file
@@ -188,16 +189,16 @@ class _Finer:
         return supersampled(lambda camera, mask: self._image(camera, mask, options), view.camera, view.mask, self.times)
 
     def mixed(self, view: View, full: Tensor, options: RenderOptions) -> Tensor:
-        """(3, H, W) with what the judge replaced, of an image ``full`` of the method alone."""
+        """(3, H, W) what counts of a view, of an image ``full`` of the method alone."""
         from rtgs.evaluate.supersample import supersampled
 
         mixture = self.mixture
         assert mixture is not None
         if self.times == 1:
-            return mixture.of(view.camera, full)
+            return mixture.of(view.camera, full, view.mask, options)
 
         def render(camera: Camera, mask: Tensor | None) -> Tensor:
-            return mixture.of(camera, self._image(camera, mask, options))
+            return mixture.of(camera, self._image(camera, mask, options), mask, options)
 
         return supersampled(render, view.camera, view.mask, self.times)
 

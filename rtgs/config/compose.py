@@ -47,9 +47,9 @@ def compose_plain(method: str, choices: Choices) -> tuple[MethodSettings, Schedu
     return _own_numbers(_groups(choices, method=method, ablation="", experiment=""), words)
 
 
-def compose_teacher(preset: str, choices: Choices) -> tuple[MethodSettings, ScheduleSettings]:
-    """The recipe of a run at another preset, with its ablation, its experiment and its words for the training; an empty
-    ``preset`` is the run's own.
+def compose_other(preset: str, choices: Choices) -> tuple[MethodSettings, ScheduleSettings]:
+    """The recipe of a run's further models: at another preset, with its ablation, its experiment and its words for the
+    training; an empty ``preset`` is the run's own.
 
     Raises:
         hydra.errors.HydraException: no such preset.

@@ -51,6 +51,9 @@ def to_run_config(composed: DictConfig, choices: Choices) -> tuple[RunConfig, Ch
     _refuse_preset_of_others(config, choices)
     if config.distill.teachers:
         _refuse_preset_of_others(config, replace(choices, preset=config.distill.preset), "distill.preset")
+    if config.ensemble.members > 1:
+        _refuse_preset_of_others(config, replace(choices, preset=config.ensemble.preset), "ensemble.preset")
+        _refuse_two_kinds_of_models(config, choices)
     _refuse_idle_ablation(config, choices)
     config = _of_external(config)
     method, schedule = scaled_steps(with_own(config.method), config.schedule, config.steps_scaler)
@@ -99,6 +102,17 @@ def with_own(method: MethodSettings) -> MethodSettings:
         return replace(method, own={})
     made = find_method(method.name).own_settings(method)
     return replace(method, own={k: v for k, v in asdict(made).items() if v != getattr(type(made)(), k)})
+
+
+def _refuse_two_kinds_of_models(config: RunConfig, choices: Choices) -> None:
+    """An ensemble is of models of one kind, trained on the photos alone.
+
+    Raises:
+        RtgsError: it is asked for by a word, not by a preset, and so is a judge, or teachers.
+    """
+    asked = any(word.lstrip("+").startswith("ensemble.members=") for word in choices.overrides)
+    if asked and (other := why_one_model(config)):
+        raise RtgsError(f"config: ensemble.members={config.ensemble.members} with {other}: give one of the two")
 
 
 def _refuse_preset_of_others(config: RunConfig, choices: Choices, key: str = "preset") -> None:
@@ -234,3 +248,16 @@ def _absolute(path: str) -> str:
 def judged(config: RunConfig) -> bool:
     """Whether a plain method is compared with the run's own."""
     return config.judge.plain not in ("", config.method.name)
+
+
+def why_one_model(config: RunConfig) -> str:
+    """The words that leave a run without further models, whatever its preset says; empty: none does."""
+    if judged(config):
+        return f"judge.plain={config.judge.plain}"
+    return f"distill.teachers={config.distill.teachers}" if config.distill.teachers else ""
+
+
+def models_of(config: RunConfig) -> int:
+    """How many models a run's pictures are the mean of; 1: no mean is taken."""
+    alone = pictures_only(config) or why_one_model(config)
+    return 1 if alone else config.ensemble.members

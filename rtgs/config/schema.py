@@ -186,6 +186,19 @@ class Choices:
 
 
 @dataclass(frozen=True)
+class EnsembleConfig:
+    """Models with other seeds beside the run's: its pictures are the mean of theirs (docs/ensemble.md)."""
+
+    members: int = 1
+    """How many models, the run's own among them; the others' seeds are seed + 1000, seed + 2000 and so on."""
+    preset: str = ""
+    """The preset of the others' recipe, on the scene of the run. Empty: the run's."""
+
+    def __post_init__(self) -> None:
+        refuse_unless(1 <= self.members <= 10, "ensemble.members", self.members, "1 to 10")
+
+
+@dataclass(frozen=True)
 class RunConfig:
     """One run: a method trained on a scene with a budget, measured and reported."""
 
@@ -204,6 +217,7 @@ class RunConfig:
     ablation: AblationConfig = field(default_factory=AblationConfig)
     judge: JudgeConfig = field(default_factory=JudgeConfig)
     distill: DistillConfig = field(default_factory=DistillConfig)
+    ensemble: EnsembleConfig = field(default_factory=EnsembleConfig)
     table: TableConfig = field(default_factory=TableConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     paths: PathsConfig = field(default_factory=PathsConfig)
@@ -224,7 +238,12 @@ class RunConfig:
         refuse_unless(0 < scaler < math.inf, "steps_scaler", scaler, "above 0 and finite")
         refuse_unless(self.threads is None or self.threads <= _MOST_THREADS, "threads", self.threads, "at most 1024")
 
+    def other_seed(self, number: int) -> int:
+        """The seed of a further model, from 1 on, that teaches this run's or stands beside it."""
+        return self.seed + _APART * number
 
+
+_APART = 1000  # between the seeds of models of one run: those of a sweep over seeds stay apart
 _MOST_THREADS = 1024  # no machine has more cores
 
 

@@ -99,6 +99,13 @@ def with_pause(looks: Sequence[Look], steps: int, seconds: float) -> list[Look]:
     return [*before, *([_later(before[-1], seconds)] if before and seconds > 0 else []), *after]
 
 
+def with_others(looks: Sequence[Look], end: Look) -> list[Look]:
+    """The looks of a training after which the further models of an ensemble are trained: until the ``end`` of those the
+    quality is that of the one model, and then it is the ensemble's."""
+    last = looks[-1]
+    return [*looks, _later(last, end.cpu_seconds - last.cpu_seconds), end]
+
+
 def _later(look: Look, seconds: float) -> Look:
     return Look(look.steps, look.cpu_seconds + seconds, look.psnr, look.psnr_masked)
 

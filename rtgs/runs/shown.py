@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rtgs.core.errors import RtgsError
-from rtgs.runs.mixture import Mixture, read_mixture
+from rtgs.runs.mixture import Mixture, is_member, read_mixture
 from rtgs.runs.record import RUN_FILE, RunRecord, find_run
 from rtgs.runs.training import last_training, load_method, object_mesh_of, read_history
 from rtgs.runs.views import seen_maps
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from rtgs.methods.model import Model
     from rtgs.scenes.scene import Scene
 
-NEEDED = ("import_scene", "train_", "judge", "plain")  # what the names of the steps that make a model begin with
+_NEEDED = ("import_scene", "train_", "judge", "plain")  # what the names of the steps that make a model begin with
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class ShownRun:
     scene: Scene  # what it was trained on; ``scene.test`` are the held-out views
     method: Model
     step: int  # as of which it is rendered: the end of its training
-    mixture: Mixture | None  # what a judge replaced by a plain method; None: nothing
+    mixture: Mixture | None  # of an ensemble, or what a judge replaced by a plain method; None: it is one model
     trainings: Mapping[str, Path]  # the artifacts of its stages
 
     @property
@@ -96,7 +96,7 @@ class ShownRun:
     def maps(self, camera: Camera, mask: Tensor | None = None) -> dict[str, Tensor]:
         """What :meth:`render` gives, by name: ``image``, ``depth``, ``alpha``, ``normal`` and the layers."""
         maps = seen_maps(self.method, camera, self.step, mask)
-        return maps if self.mixture is None else maps | {"image": self.mixture.of(camera, maps["image"])}
+        return maps if self.mixture is None else maps | {"image": self.mixture.of(camera, maps["image"], mask)}
 
     def render(self, camera: Camera, mask: Tensor | None = None) -> LayeredView:
         """The view of a camera, all sets together.
@@ -159,6 +159,11 @@ def locate_run(root: Path, name: str | None) -> Path:
     return find_run(root / "runs", name)
 
 
+def needed_steps(record: RunRecord) -> dict[str, str]:
+    """The steps that make a run's model and its scene, by name: their fingerprints."""
+    return {name: key for name, key in record.steps.items() if name.startswith(_NEEDED) or is_member(name)}
+
+
 def open_run(folder: Path, store: Store | None = None) -> ShownRun:
     """Read the model of a run folder from the store (None: the one that lies beside ``runs/``).
 
@@ -171,7 +176,7 @@ def open_run(folder: Path, store: Store | None = None) -> ShownRun:
     if record is None:
         raise RtgsError(f"{folder} is no run folder: {RUN_FILE} is not there")
     store = store or Store(folder.absolute().parent.parent / "store")
-    wanted = {name: key for name, key in record.steps.items() if name.startswith(NEEDED)}
+    wanted = needed_steps(record)
     if missing := [name for name, key in wanted.items() if not store.has(name, key)]:
         raise RtgsError(
             f"{folder.name}: {', '.join(missing)} is not in {store.root} any more; `{record.command}` makes it again"

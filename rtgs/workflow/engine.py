@@ -199,6 +199,7 @@ class DaskExecutor:
         store = Store(Path(self.job.store))
         done = dict(_cached(plan, store))
         waiting = [planned.step for planned in plan if planned.step.fingerprint not in done]
+        needs = {step.fingerprint: step.needs_of for step in waiting}
         futures: dict[str, Any] = {}
         running = as_completed(())
         workers: Any = self.client.nthreads()  # by address; a coroutine only where the client is asynchronous
@@ -208,7 +209,7 @@ class DaskExecutor:
                 outcome = _outcome(future)
                 done[outcome.fingerprint] = outcome
                 if self.room:
-                    self.room.give(outcome.step)
+                    self.room.give(needs[outcome.fingerprint])
                 self._start(waiting, futures, done, running)
                 tick(outcome)
         return SweepOutcomes({planned.step.fingerprint: done[planned.step.fingerprint] for planned in plan})
@@ -218,8 +219,8 @@ class DaskExecutor:
         full, kept = False, []
         for step in waiting:
             ready = self.room is None or all(other.fingerprint in done for other in step.upstream)
-            if self.room and not (ready and not full and self.room.take(step.name)):
-                full |= ready and self.room.waits_for_room(step.name)
+            if self.room and not (ready and not full and self.room.take(step.needs_of)):
+                full |= ready and self.room.waits_for_room(step.needs_of)
                 kept.append(step)
                 continue
             before = [futures[other.fingerprint] for other in step.upstream if other.fingerprint in futures]
@@ -241,7 +242,7 @@ def run_step(step: Step, job: WorkerJob, before: list[StepOutcome]) -> StepOutco
     """On a worker: one step whose upstream is in the store, or in the remote one."""
     import torch
 
-    torch.set_num_threads(job.step_threads.get(step.name, job.threads))
+    torch.set_num_threads(job.step_threads.get(step.needs_of, job.threads))
     tracking = open_tracking(job.tracking, Path(job.tracking_root), job.tracking_uri)
     remote = RemoteStore(job.remote) if job.remote else None
     executor = InlineExecutor(Store(Path(job.store)), tracking, remote, quiet=True)

@@ -176,8 +176,8 @@ class InlineExecutor:
             log.warning("%s was cut before: its process was killed, %s", step.label, IF_MEMORY)
         attempt, partial = self.store.new_attempt(step.name, step.fingerprint), self.store.partial(step)
         partial.mkdir(parents=True, exist_ok=True)
-        inputs = {other.name: self.store.folder(other) for other in step.upstream}
-        tags = {f"rtgs.upstream.{other.name}": other.fingerprint for other in step.upstream}
+        inputs = {other.known_as: self.store.folder(other) for other in step.upstream}
+        tags = {f"rtgs.upstream.{name}": key for name, key in step.upstream_keys.items()}
         info = RunInfo(STEPS_EXPERIMENT, step.label, step.fingerprint, {STEP_TAG: step.name, **tags})
         spare_what_is_loaded()
         start, cpu = time.perf_counter(), work_time()

@@ -31,7 +31,7 @@ TRAINING_STEP_SECONDS = {"plain": 0.015, "train_diffuse": 0.015, "train_reflecti
 TRAINING_STEP_SECONDS |= {"train_transmittance": 0.1}
 OTHER_TRAINING_STEP_SECONDS = 0.1
 _REST = "_rest"  # of a training: at the pace of what it goes on with, unless a judge has dropped it
-_TEACHER = "teacher_"  # trainings at the pace of the method that they teach
+_FURTHER = ("teacher_", "member_")  # steps of further models: at the pace of the run's own
 _PRIOR_SECONDS = 20.0  # weight of the expectation against what was seen
 
 
@@ -51,8 +51,8 @@ class Expectation:
     def seconds(self, step: Step) -> float:
         """Of runs of this step name, those of the same method if there are any; training by the number of its steps."""
         name = step.name.removesuffix(_REST)
-        if name.startswith(_TEACHER):
-            name = f"train_{step.recipe['stage']}"
+        if name.startswith(_FURTHER):
+            name = step.needs_of
         if name not in self._recorded:
             self._recorded[name] = [artifact.manifest for artifact in self._store.artifacts(name)]
         count, recorded = training_steps(step.recipe), self._recorded[name]

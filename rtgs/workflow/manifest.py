@@ -89,7 +89,7 @@ def describe(step: Step, folder: Path, duration: float, created: str, cpu_second
         version=step.version,
         fingerprint=step.fingerprint,
         params=step.recipe,
-        upstream={other.name: other.fingerprint for other in step.upstream},
+        upstream=step.upstream_keys,
         tools=dict(step.tools),
         files={
             path.relative_to(folder).as_posix(): FileRecord(path.stat().st_size, sha256_of(path))

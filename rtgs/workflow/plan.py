@@ -148,8 +148,7 @@ def _recipe_of(source: Step | Manifest) -> dict[str, str]:
     if isinstance(source, Manifest):
         params, upstream, tools = source.params, source.upstream, source.tools
     else:
-        params, tools = source.recipe, dict(source.tools)
-        upstream = {other.name: other.fingerprint for other in source.upstream}
+        params, upstream, tools = source.recipe, source.upstream_keys, dict(source.tools)
     flat = {f"params.{key}": repr(value) for key, value in flatten(params).items()}
     flat |= {f"upstream.{key}": value for key, value in upstream.items()}
     return flat | {f"tools.{key}": str(value) for key, value in tools.items()} | {"version": str(source.version)}
@@ -160,7 +159,7 @@ def differences(step: Step, manifest: Manifest) -> list[str]:
     found = []
     if manifest.version != step.version:
         found.append(f"step version: {manifest.version} -> {step.version}")
-    upstream = {other.name: other.fingerprint for other in step.upstream}
+    upstream = step.upstream_keys
     for name in sorted(upstream.keys() | manifest.upstream.keys()):
         if upstream.get(name) != manifest.upstream.get(name):
             found.append(f"upstream {name} changed")

@@ -15,7 +15,7 @@ _SIZE = re.compile(r"(\d+(?:\.\d+)?)\s*([kmgt]i?b)", re.IGNORECASE)
 
 @dataclass(frozen=True)
 class StepNeeds:
-    """By the name of the step; a step that is in none of them takes a worker's threads and is not limited.
+    """By the kind of the step; a step that is in none of them takes a worker's threads and is not limited.
 
     Attributes:
         threads: of torch, the native core and COLMAP.

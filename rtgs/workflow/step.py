@@ -69,6 +69,9 @@ class Step:
         run: the work; sees ``params`` and a :class:`StepContext`, nothing else.
         upstream: steps whose artifacts it reads.
         tools: (name, version) of outside tools that change the result, such as the hash of a network's weights.
+        role: what the steps that build on it know it as; empty: its name. No two steps of a run have one name, and one
+            that trains a further model looks for the same inputs as the one that trains the run's.
+        kind: the name of its :class:`StepKind`, by which launchers know what it needs; empty: its name.
     """
 
     name: str
@@ -77,6 +80,8 @@ class Step:
     run: StepFunction
     upstream: tuple[Step, ...] = ()
     tools: tuple[tuple[str, str], ...] = ()
+    role: str = ""
+    kind: str = ""
 
     def __post_init__(self) -> None:
         if not _NAME.fullmatch(self.name):
@@ -84,7 +89,7 @@ class Step:
         frozen = getattr(type(self.params), "__dataclass_params__", None)
         if not dataclasses.is_dataclass(self.params) or not (frozen and frozen.frozen):
             raise TypeError(f"step {self.name}: params is a {type(self.params).__name__}, must be a frozen dataclass")
-        names = [step.name for step in self.upstream]
+        names = [step.known_as for step in self.upstream]
         if len(set(names)) != len(names):
             raise ValueError(f"step {self.name}: upstream steps {names} share a name; inputs are told apart by name")
 
@@ -104,10 +109,25 @@ class Step:
                 "step": self.name,
                 "version": self.version,
                 "params": self.recipe,
-                "upstream": {step.name: step.fingerprint for step in self.upstream},
+                "upstream": self.upstream_keys,
                 "tools": dict(self.tools),
             }
         )
+
+    @property
+    def known_as(self) -> str:
+        """What it is called among the inputs of the steps that build on it."""
+        return self.role or self.name
+
+    @property
+    def needs_of(self) -> str:
+        """By what name the needs of its kind are given (:class:`rtgs.workflow.resources.StepNeeds`)."""
+        return self.kind or self.name
+
+    @property
+    def upstream_keys(self) -> dict[str, str]:
+        """The fingerprints of the steps that it builds on, by what it knows them as."""
+        return {step.known_as: step.fingerprint for step in self.upstream}
 
     @property
     def label(self) -> str:
@@ -131,7 +151,7 @@ class StepKind:
         self, params: Any, *upstream: Step, name: str | None = None, tools: tuple[tuple[str, str], ...] = ()
     ) -> Step:
         """This kind with parameters; ``name`` when one kind serves several nodes (one step per training stage)."""
-        return Step(name or self.name, self.version, params, self.run, upstream, tools)
+        return Step(name or self.name, self.version, params, self.run, upstream, tools, kind=self.name)
 
 
 class StepFailed(RtgsError):

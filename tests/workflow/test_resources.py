@@ -13,7 +13,7 @@ import pytest
 import toy
 
 from rtgs.core.errors import RtgsError
-from rtgs.workflow import NOT_IN_RECIPE, Step, StepContext, Store, make_plan
+from rtgs.workflow import NOT_IN_RECIPE, Step, StepContext, StepKind, Store, make_plan
 from rtgs.workflow.engine import DaskExecutor, EngineSettings, WorkerJob, _cluster, open_client
 from rtgs.workflow.resources import Room, StepNeeds, bytes_of
 
@@ -77,6 +77,20 @@ def test_preparation_leaves_workers_to_the_trainings(tmp_path):
     assert {(name, threads) for name, _, _, threads, _ in found} == {("sfm", 2), ("train_diffuse", 1)}
     first_training = min(begin for name, begin, *_ in found if name == "train_diffuse")
     assert first_training < max(begin for name, begin, *_ in found if name == "sfm"), "trainings waited for all of sfm"
+
+
+def test_a_step_under_another_name_needs_what_its_kind_does(tmp_path):
+    """So do the trainings of further models, and a kind's limit counts them as well."""
+    kind = StepKind("train_diffuse", 1, noted)
+    steps = [kind.step(Noted(n, str(tmp_path)), name=f"member_{n}" if n else None) for n in range(3)]
+    assert [step.needs_of for step in steps] == ["train_diffuse"] * 3
+    assert steps[0].fingerprint == Step("train_diffuse", 1, steps[0].params, noted).fingerprint
+    settings = EngineSettings(workers=3, threads=1, step_limit=["train_diffuse:1"], step_threads=["train_diffuse:2"])
+    assert not run(tmp_path, settings, *steps).failures
+    found = rows(tmp_path)
+    assert {threads for _, _, _, threads, _ in found} == {2}
+    assert {name for name, *_ in found} == {"train_diffuse", "member_1", "member_2"}
+    assert most_at_once(found) == 1
 
 
 def test_steps_that_would_not_fit_into_memory_wait_for_each_other(tmp_path):

@@ -9,7 +9,6 @@ import pytest
 from PIL import Image
 
 from pipelines.cli.plan import plan_of_words
-from pipelines.planning.distilling import APART
 from pipelines.planning.graph import RunGraph, build_graph, shown_values
 from pipelines.planning.plan import steps_of_words
 from pipelines.steps.pseudo_views import PseudoParams
@@ -36,7 +35,7 @@ def test_each_teacher_has_a_seed_of_its_own_and_only_the_pseudo_views_know_them(
     *teachers, pseudo = found.distill
     (student,) = found.training
     assert [step.name for step in teachers] == ["teacher_1", "teacher_2", "teacher_3"]
-    assert [step.params.seed for step in teachers] == [2 + APART, 2 + 2 * APART, 2 + 3 * APART]
+    assert [step.params.seed for step in teachers] == [1002, 2002, 3002]
     assert all(replace(step.params, seed=2) == student.params for step in teachers)
     assert all(step.upstream == (found.scene,) for step in teachers)
     assert pseudo.upstream == (found.scene, *teachers)

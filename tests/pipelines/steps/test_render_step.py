@@ -18,6 +18,7 @@ from rtgs.light.settings import CubemapSettings
 from rtgs.methods import Mode, RenderedView, RenderOptions
 from rtgs.methods.parts.part import Frame, Raster
 from rtgs.render.buffers import RasterBuffers
+from rtgs.runs.mixture import Ensemble
 from rtgs.runs.views import read_coverage, read_render
 from rtgs.scenes.canonical import save_scene
 from rtgs.scenes.scene import Scene, View
@@ -166,7 +167,8 @@ def test_the_image_from_the_refined_pose_is_made_as_the_other_is(context, monkey
     """As fine, and with what the judge replaced: only their poses tell the two apart."""
 
     class Judge:
-        def of(self, camera: Camera, image: torch.Tensor) -> torch.Tensor:
+        def of(self, camera: Camera, image: torch.Tensor, mask: object, options: RenderOptions) -> torch.Tensor:
+            assert options == RenderOptions()
             return (image - (0.25 if camera.name.startswith("refined") else 0.125)).clamp_min(0)
 
     def refined(method: object, view: View, step: int, *, steps: int) -> Camera:
@@ -182,6 +184,38 @@ def test_the_image_from_the_refined_pose_is_made_as_the_other_is(context, monkey
     shown = (base - 0.125, 0.0 if times == 1 else 0.05) if judged else (base, base)
     for image, value in zip((timed.image, timed.refined), shown):
         torch.testing.assert_close(image.mean(), torch.tensor(value))
+
+
+@dataclass
+class Brighter(CountingMethod):
+    """Another model: brighter than white where masks are given, and it remembers the masks."""
+
+    masks: list[torch.Tensor | None] = field(default_factory=list)
+
+    def render(
+        self, camera: Camera, step: int, mode: Mode, options: RenderOptions, mask: torch.Tensor | None
+    ) -> RenderedView:
+        self.masks.append(mask)
+        found = super().render(camera, step, mode, options, mask)
+        return replace(found, image=found.image + 0.5)
+
+
+@pytest.mark.parametrize("times", [1, 2])
+def test_an_ensemble_shows_the_mean_seen_through_the_same_masks(context, monkeypatch, times: int) -> None:
+    method, other = CountingMethod(glass=True), Brighter(glass=True)
+    monkeypatch.setattr(render, "read_mixture", lambda inputs, scene: Ensemble(((other, 100),)))
+    params = render.RenderParams(supersample=times, preview=0)
+    run(context, method, monkeypatch, maps=True, params=params)
+    plain, given = RenderOptions(), RenderOptions(masks="given")
+    assert other.asked == [("0.png", plain), ("0.png", given), ("1.png", plain)]
+    assert [mask is not None for mask in other.masks] == [True, True, False]
+    tensors = read_render(context.out, "0.png")
+    finer = 0.0 if times == 1 else 0.05
+    for name, value in (("image", 0.5), (render.FULL, 0.25)):
+        torch.testing.assert_close(tensors[name].mean(), torch.tensor(value + finer))
+    of_given = ((0.75 + 1) / 2,) if times == 1 else (0.85 / 2 + 0.5, 0.75 / 2 + 0.5)  # within 0 and 1 before the mean
+    torch.testing.assert_close(tensors[render.GIVEN].mean(), torch.tensor(sum(of_given) / len(of_given)))
+    assert set(tensors) == {"image", render.FULL, render.GIVEN, "depth", "alpha"}
 
 
 @pytest.mark.parametrize("maps", [True, False])

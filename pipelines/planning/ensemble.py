@@ -1,0 +1,62 @@
+"""What an ensemble adds to a run: whole trainings with other seeds, whose pictures the run's own are averaged with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from rtgs.config.compose import compose_other
+from rtgs.config.convert import models_of, why_one_model
+from rtgs.config.schema import Choices, RunConfig
+from rtgs.core.decisions import Decision
+from rtgs.runs.mixture import member_name
+from rtgs.train.settings import WatchSettings
+from rtgs.workflow import Step
+
+
+@dataclass(frozen=True)
+class Members:
+    """The trainings of the further models."""
+
+    steps: tuple[Step, ...] = ()  # all of them, in order, with no role: as pages and tables know them
+    last: tuple[Step, ...] = ()  # one of each model: where its training ends
+    noted: tuple[Decision, ...] = ()  # what plans and pages say of it
+
+
+def members_of(config: RunConfig, choices: Choices, training: Callable[[RunConfig], tuple[Step, ...]]) -> Members:
+    """The further models of a run; none where it has one model, or its pictures are another program's.
+
+    ``training``: the steps of a whole training, the meshes that it waits for among them, each after what it builds on.
+
+    Raises:
+        hydra.errors.HydraException: ensemble.preset is no preset.
+    """
+    count = models_of(config)
+    if count == 1:
+        return Members(noted=_why_alone(config))
+    method, schedule = compose_other(config.ensemble.preset, choices)
+    chains = []
+    for number in range(1, count):
+        own = replace(config, method=method, schedule=schedule, seed=config.other_seed(number), watch=WatchSettings())
+        chains.append(_renamed(training(own), number))
+    steps = tuple(replace(step, role="") for chain in chains for step in chain)
+    why = f"ensemble.members={count}: pictures are their mean; maps, layers and .ply files are of the run's own"
+    return Members(steps, tuple(chain[-1] for chain in chains), (Decision(f"{count} models", why),))
+
+
+def _why_alone(config: RunConfig) -> tuple[Decision, ...]:
+    """Why a run whose preset asks for further models has none; empty: it does not, or trains nothing."""
+    if config.ensemble.members == 1 or not (why := why_one_model(config)):
+        return ()
+    return (Decision("one model", f"{why}, which goes before ensemble.members={config.ensemble.members}"),)
+
+
+def _renamed(training: tuple[Step, ...], number: int) -> tuple[Step, ...]:
+    """The steps under names of their own, which know each other as those of a run do; the last one is the member."""
+    renamed: dict[str, Step] = {}
+    for step in training:
+        upstream = tuple(renamed.get(other.fingerprint, other) for other in step.upstream)
+        last = step is training[-1]
+        name, role = (member_name(number), "") if last else (member_name(number, step.name), step.name)
+        renamed[step.fingerprint] = replace(step, name=name, role=role, upstream=upstream)
+    return tuple(renamed.values())
