@@ -7,7 +7,7 @@ import io
 
 import pytest
 
-from rtgs.evaluate.curves import Look, QualityCurve, comma_separated, markdown, with_pause
+from rtgs.evaluate.curves import Look, QualityCurve, comma_separated, markdown, with_others, with_pause
 
 LOOKS = (Look(10, 10.0, 20.0), Look(20, 20.0, 28.0), Look(40, 40.0, 29.0), Look(80, 90.0, 30.0))
 
@@ -43,6 +43,16 @@ def test_a_training_that_waits_for_its_mesh_stands_still_meanwhile():
     assert at is not None
     assert (at.steps, at.psnr) == (20, 28.0)
     assert with_pause(LOOKS, 80, 0.0) == list(LOOKS)
+
+
+def test_the_further_models_of_an_ensemble_count_when_they_are_trained():
+    """Until then the quality is that of the run's own model."""
+    last = LOOKS[-1]
+    made = curve(with_others(LOOKS, Look(last.steps, last.cpu_seconds + 100.0, last.psnr + 2.0, None)))
+    assert made.looks[: len(LOOKS)] == LOOKS
+    assert made.at_seconds(last.cpu_seconds + 99.0).psnr == last.psnr
+    assert made.at_seconds(last.cpu_seconds + 101.0).psnr == last.psnr + 2.0
+    assert made.at_steps(last.steps).psnr == last.psnr
 
 
 def test_equal_times_and_equal_steps_stand_in_one_table():

@@ -12,7 +12,7 @@ from pipelines.publishing import time_quality
 from pipelines.publishing.time_quality import write_time_quality
 from pipelines.steps.import_scene import ImportParams
 from rtgs.config import compose
-from rtgs.evaluate.records import EvaluationTable, RunFacts
+from rtgs.evaluate.records import EvaluationTable, RunFacts, ViewScore
 from rtgs.methods.settings import MethodSettings
 from rtgs.runs.training import HISTORY_FILE, StageParams
 from rtgs.scenes.settings import SceneSettings
@@ -61,6 +61,22 @@ def test_the_mesh_of_a_stage_makes_what_follows_later(tmp_path: Path, monkeypatc
     text = paths[0].read_text()
     assert "| rtgs, quick | 24.00 |" in text  # after 15 s: the state before the mesh
     assert ("seconds by the wall" in text) == (cpu_seconds is None)
+
+
+def test_the_curve_of_an_ensemble_ends_with_the_mean_of_all(tmp_path: Path, monkeypatch):
+    """At the CPU time of all trainings; ``preset=quick`` of the same run ends before."""
+    scene = Step("import_scene", 1, ImportParams(SceneSettings(), "x", ""), unrun)
+    made = [result(tmp_path / "train", stage("diffuse", 0, 20, scene))]
+    row = {"step": 20, "watch/cpu_seconds": 12.0, "watch/psnr": 24.0}
+    (made[0].folder / HISTORY_FILE).write_text(f"{json.dumps(row)}\n")
+    rows = tuple(ViewScore(f"{n}.png", 4, 3, None, {"psnr": value}) for n, value in enumerate((25.0, 26.0)))
+    table = EvaluationTable(RunFacts("toycar", "2dgs, mean of 3", "smoke", train_cpu_seconds=40.0), rows)
+    monkeypatch.setattr(time_quality, "evaluation_of", lambda results: table)
+    words = ["scene=toycar", "method=2dgs", "preset=smoke", "watch.steps=[20]"]
+    for more, expected in ((["ensemble.members=3"], [(12.0, 24.0), (40.0, 24.0), (40.0, 25.5)]), ([], [(12.0, 24.0)])):
+        curve = time_quality._curve(compose([*words, *more])[0], made)
+        assert [(look.cpu_seconds, look.psnr) for look in curve.looks] == expected
+        assert {look.steps for look in curve.looks} == {20}
 
 
 def test_what_goes_on_after_a_judge_has_not_waited_for_the_mesh_again(tmp_path: Path):
