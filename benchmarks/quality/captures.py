@@ -49,6 +49,7 @@ class Job:
         method, _, ablation = self.method.partition("+")
         words = [f"scene={self.scene}", f"method={method}", f"preset={arguments.preset}", f"seed={self.seed}"]
         words += [f"ablation={ablation}"] if ablation else []
+        words += ["ensemble.members=1"]  # a step is one of the run's own model
         return [*words, f"threads={arguments.threads}", "tracking=off", *arguments.set]
 
     def name(self, arguments: argparse.Namespace) -> str:

@@ -127,9 +127,7 @@ def viewed(config: RunConfig, plan: Plan) -> Iterator[Viewer | None]:
 
 def _trains(planned: PlannedStep) -> bool:
     """Whether a step is a training that will run here; one of the remote store is fetched."""
-    from rtgs.runs.mixture import TRAININGS
-
-    training = planned.step.name.startswith(TRAININGS)
+    training = planned.step.needs_of.startswith("train_")
     return training and not planned.hit and not planned.remote
 
 

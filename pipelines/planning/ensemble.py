@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from rtgs.config.compose import compose_other
-from rtgs.config.convert import models_of, why_one_model
+from rtgs.config.convert import models_of, pictures_only, why_one_model
 from rtgs.config.schema import Choices, RunConfig
 from rtgs.core.decisions import Decision
 from rtgs.runs.mixture import member_name
@@ -45,8 +45,9 @@ def members_of(config: RunConfig, choices: Choices, training: Callable[[RunConfi
 
 
 def _why_alone(config: RunConfig) -> tuple[Decision, ...]:
-    """Why a run whose preset asks for further models has none; empty: it does not, or trains nothing."""
-    if config.ensemble.members == 1 or not (why := why_one_model(config)):
+    """Why a run whose preset asks for further models has none; empty: it does not, or trains nothing at all."""
+    why = why_one_model(config)
+    if config.ensemble.members == 1 or not why or pictures_only(config):
         return ()
     return (Decision("one model", f"{why}, which goes before ensemble.members={config.ensemble.members}"),)
 

@@ -278,8 +278,7 @@ def row_label(config: RunConfig, choices: Choices) -> str:
     """With what a judge does to it: such rows are not the pure method's. Of other programs' pictures their name."""
     if pictures_only(config):
         return config.external.name or method_label(choices)
-    label = f"{method_label(choices)}, judged" if judged(config) else method_label(choices)
-    return label if (count := models_of(config)) == 1 else f"{label}, mean of {count}"
+    return f"{method_label(choices)}, judged" if judged(config) else method_label(choices)
 
 
 def _report_params(
@@ -287,7 +286,8 @@ def _report_params(
 ) -> report.ReportParams:
     values, defaults = shown_values(config), shown_values(RunConfig())
     lines = {key: (str(values[key]), str(defaults.get(key, ""))) for key in sorted(values)}
-    title = f"{config.scene.name}: {row_label(config, choices)}, {choices.preset}"
+    mean = f", mean of {count}" if (count := models_of(config)) > 1 else ""
+    title = f"{config.scene.name}: {row_label(config, choices)}, {choices.preset}{mean}"
     decisions = [(f"no {step.what} step", step.why) for step in skipped]
     decisions += [(each.what, each.why) for each in noted]
     if pictures_only(config):

@@ -11,6 +11,7 @@ from rtgs.core.errors import RtgsError
 from rtgs.core.files import sha256_of
 from rtgs.core.records import read_record, write_json
 from rtgs.methods.spec import RASTERIZED
+from rtgs.runs.mixture import Judged
 from rtgs.runs.record import RunRecord
 from rtgs.runs.shown import needed_steps
 
@@ -232,7 +233,7 @@ def has_glass(run: ShownRun) -> bool:
     """Whether the model shows a transparent object by rays of its own, everywhere."""
     from rtgs.export.glass import glass_part
 
-    return glass_part(run.method) is not None and run.mixture is None
+    return glass_part(run.method) is not None and not isinstance(run.mixture, Judged)
 
 
 def _plain(run: ShownRun) -> Gaussians:

@@ -70,7 +70,7 @@ def figures_of(config: RunConfig, results: Sequence[StepResult]) -> dict[str, Sc
     """What a run is and what it reached, means over the test views; None: not measured."""
     table = evaluation_of(results)
     facts = table.facts
-    told = {"scene": facts.scene, "method": facts.method, "preset": facts.preset, "seed": config.seed}
+    told = {"scene": facts.scene, "method": facts.shown_method, "preset": facts.preset, "seed": config.seed}
     return {
         **told,
         **{shown: table.mean(name) for shown, name in _FIGURES},

@@ -90,6 +90,7 @@ def evaluate(params: EvaluateParams, context: StepContext) -> None:
             train_seconds=summary.seconds,
             train_cpu_seconds=summary.cpu_seconds,
             peak_memory_mb=summary.peak_memory_mb,
+            models=1 + len(members_of(context.inputs)),
         )
     rendered = context.inputs["render"]
     times = RenderTimes.read(rendered)

@@ -99,10 +99,10 @@ def render(params: RenderParams, context: StepContext) -> None:
     """Render every test view.
 
     Writes ``images/<stem>.png`` (8 bit, stems of ``unique_stems``), ``views/<stem>.safetensors`` (float32: image (3,
-    H, W) not clamped, depth (H, W) z-depth divided by alpha in world units, normal (3, H, W) world frame where the
-    method has one, alpha (H, W); with a third stage also ``image_given_masks``; of an ensemble, and where a judge kept
-    the plain method, ``image_full``, which is of the run's model alone, as all maps and layers are; with
-    ``refine_steps``, where poses were learned or ``refine_all`` is on, also ``image_refined_pose``),
+    H, W), not clamped unless it is a mean, depth (H, W) z-depth divided by alpha in world units, normal (3, H, W) world
+    frame where the method has one, alpha (H, W); with a third stage also ``image_given_masks``; of an ensemble, and
+    where a judge kept the plain method, ``image_full``, which is of the run's model alone, as all maps and layers are;
+    with ``refine_steps``, where poses were learned or ``refine_all`` is on, also ``image_refined_pose``),
     ``coverage.safetensors`` (by view name (H, W) int16: training views that show what the pixel shows),
     ``preview.webp`` (a way round the scene that plays for ever, small) and ``render.json`` (:class:`RenderTimes`).
     ``params.supersample`` is of the other images. Of methods with a far light also ``environment/``
@@ -132,7 +132,9 @@ def render(params: RenderParams, context: StepContext) -> None:
     for view in scene.test[:1]:  # what is loaded and made once is no view's time
         with torch.no_grad():
             small = replace(view.camera.resized(_WARM, _WARM), name=WARM_UP)
-            method.render(small, stage.until, Mode.EVALUATE, options, None)
+            first = method.render(small, stage.until, Mode.EVALUATE, options, None).image
+            if mixture is not None:
+                mixture.of(small, first)
     for view in scene.test:
         stem = stems[view.name]
         with torch.no_grad():

@@ -53,7 +53,7 @@ def to_run_config(composed: DictConfig, choices: Choices) -> tuple[RunConfig, Ch
         _refuse_preset_of_others(config, replace(choices, preset=config.distill.preset), "distill.preset")
     if config.ensemble.members > 1:
         _refuse_preset_of_others(config, replace(choices, preset=config.ensemble.preset), "ensemble.preset")
-        _refuse_two_kinds_of_models(config, choices)
+        _refuse_further_models(config, choices)
     _refuse_idle_ablation(config, choices)
     config = _of_external(config)
     method, schedule = scaled_steps(with_own(config.method), config.schedule, config.steps_scaler)
@@ -104,14 +104,14 @@ def with_own(method: MethodSettings) -> MethodSettings:
     return replace(method, own={k: v for k, v in asdict(made).items() if v != getattr(type(made)(), k)})
 
 
-def _refuse_two_kinds_of_models(config: RunConfig, choices: Choices) -> None:
+def _refuse_further_models(config: RunConfig, choices: Choices) -> None:
     """An ensemble is of models of one kind, trained on the photos alone.
 
     Raises:
-        RtgsError: it is asked for by a word, not by a preset, and so is a judge, or teachers.
+        RtgsError: it is asked for by a word, not by a preset, and so is a judge, or teachers; or nothing is trained.
     """
-    asked = any(word.lstrip("+").startswith("ensemble.members=") for word in choices.overrides)
-    if asked and (other := why_one_model(config)):
+    asked = [key for word in choices.overrides for key in _keys_of_word(word)]
+    if "ensemble.members" in asked and (other := why_one_model(config)):
         raise RtgsError(f"config: ensemble.members={config.ensemble.members} with {other}: give one of the two")
 
 
@@ -252,6 +252,8 @@ def judged(config: RunConfig) -> bool:
 
 def why_one_model(config: RunConfig) -> str:
     """The words that leave a run without further models, whatever its preset says; empty: none does."""
+    if pictures_only(config):
+        return f"method={config.method.name}"
     if judged(config):
         return f"judge.plain={config.judge.plain}"
     return f"distill.teachers={config.distill.teachers}" if config.distill.teachers else ""
@@ -259,5 +261,4 @@ def why_one_model(config: RunConfig) -> str:
 
 def models_of(config: RunConfig) -> int:
     """How many models a run's pictures are the mean of; 1: no mean is taken."""
-    alone = pictures_only(config) or why_one_model(config)
-    return 1 if alone else config.ensemble.members
+    return 1 if why_one_model(config) else config.ensemble.members

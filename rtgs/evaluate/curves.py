@@ -19,7 +19,7 @@ class Look:
     """The test views as they were scored along a training."""
 
     steps: int
-    cpu_seconds: float  # of the training until then, all threads, and of the mesh that it waited for
+    cpu_seconds: float  # of the training until then, all threads, of the mesh it waited for, and of further models
     psnr: float  # mean over the test views, dB
     psnr_masked: float | None = None  # in the masks, of the views that have one
 
@@ -46,12 +46,12 @@ class QualityCurve:
 
     def at_seconds(self, seconds: float) -> Look | None:
         """The run after so much time: between two looks linearly, after the last the last; None before the first."""
-        later = next((index for index, each in enumerate(self.looks) if each.cpu_seconds >= seconds), None)
+        if at := [each for each in self.looks if each.cpu_seconds == seconds]:
+            return at[-1]  # where an ensemble ends there are two
+        later = next((index for index, each in enumerate(self.looks) if each.cpu_seconds > seconds), None)
         if later is None:
             return self.looks[-1]
         after = self.looks[later]
-        if after.cpu_seconds == seconds:
-            return after
         if later == 0:
             return None
         before = self.looks[later - 1]
@@ -124,7 +124,8 @@ def markdown(
                 lines += [*_table(title, mine, value, minutes, steps), ""]
     lines += [
         "- Time is CPU time of the training, all threads, and of the mesh that it waited for; scoring "
-        "does not count. Between two looks it is interpolated.",
+        "does not count. Between two looks it is interpolated. The mean of several models counts at its end, when all "
+        "are trained.",
         f"- {ENDED}: the run had ended by then. {NOT_REACHED}: no look was taken there.",
         "- Knee: the look farthest above the line from the first to the last (Satopaa et al. 2011).",
         *(f"- {note}" for note in notes),

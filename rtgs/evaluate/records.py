@@ -110,6 +110,12 @@ class RunFacts:
     peak_memory_mb: float | None = None
     supersample: int = 1  # pictures were rendered so many times finer, and averaged
     noise_psnr: float | None = None  # dB of the test photos against noise-free ones: no method can be told to be better
+    models: int = 1  # whose mean the pictures are; ``steps`` are of one of them, the costs of all
+
+    @property
+    def shown_method(self) -> str:
+        """As tables of runs call it."""
+        return self.method if self.models == 1 else f"{self.method}, mean of {self.models}"
 
 
 @dataclass(frozen=True)
@@ -175,8 +181,9 @@ class EvaluationTable:
 def write_json(path: Path, table: EvaluationTable) -> None:
     """The whole table; absent figures are null and explained under ``missing``."""
     facts = asdict(table.facts)
-    if table.facts.supersample == 1:  # the file stays what it was before there was such a setting
-        del facts["supersample"]
+    for name in ("supersample", "models"):
+        if facts[name] == 1:  # the file stays what it was before there was such a setting
+            del facts[name]
     document = {
         "format": FORMAT,
         "version": VERSION,
@@ -214,7 +221,8 @@ def read_json(path: Path) -> EvaluationTable:
 def write_csv(path: Path, table: EvaluationTable) -> None:
     """One line per view, then mean and std; an absent figure is an empty field."""
     facts = asdict(table.facts)
-    del facts["supersample"]  # in the resolution of the mean
+    del facts["supersample"], facts["models"]  # in the resolution of the mean, and in the method
+    facts["method"] = table.facts.shown_method
     header = ["scene", "method", "preset", "view", "resolution", "mask_share", *table.metrics]
     header += ["steps", "surfels", "train_seconds", "train_cpu_seconds", "peak_memory_mb", "noise_psnr"]
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -103,7 +103,7 @@ def summarize(tables: Sequence[EvaluationTable]) -> list[SummaryRow]:
         rows.append(
             SummaryRow(
                 scene=facts.scene,
-                method=facts.method,
+                method=facts.shown_method,
                 preset=facts.preset,
                 resolution=table.resolution,
                 views=len(table.rows),

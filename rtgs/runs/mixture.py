@@ -25,7 +25,7 @@ JUDGE = "judge"  # names of steps: of the one that decides,
 PLAIN = "plain"  # of the one that trains the plain method
 REST = "_rest"  # and what the names of those end with that go on with a training after both were judged
 MEMBER = "member"  # what the names of the steps begin with that train the further models of an ensemble
-TRAININGS = ("train_", PLAIN)  # what the names of all steps that train begin with
+TRAININGS = ("train_", PLAIN)  # what the names of the steps begin with that train what a judge compares
 
 
 def plain_training(inputs: Mapping[str, Path]) -> Path:

@@ -36,7 +36,7 @@ class LayeredView:
     """
 
     camera: Camera
-    image: Tensor  # (3, H, W) sRGB, not clamped; with what a judge replaced
+    image: Tensor  # (3, H, W) sRGB, of one model not clamped; with what a judge replaced, or the mean of an ensemble
     depth: Tensor  # (H, W) z-depth of the base set in world units, divided by alpha; 0 where there is nothing
     alpha: Tensor  # (H, W) of the base set
     normal: Tensor | None  # (3, H, W) world frame; None: the method has none

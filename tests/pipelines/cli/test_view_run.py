@@ -217,7 +217,7 @@ class Opened(FakePage):
 
 
 def step(name: str) -> Step:
-    return Step(name, 1, NoParams(), lambda params, context: None)
+    return Step(name, 1, NoParams(), lambda params, context: None, kind="judge" if name == "judge" else "train_diffuse")
 
 
 @pytest.mark.parametrize(
@@ -225,6 +225,7 @@ def step(name: str) -> Step:
     [
         *(("plain", False, True), ("plain_rest", False, True), ("train_diffuse_rest", False, True)),
         *(("train_diffuse", False, True), ("train_diffuse", True, False), ("judge", False, False)),
+        *(("member_1", False, True), ("teacher_2", False, True), ("member_1", True, False)),
     ],
 )
 def test_a_page_is_opened_for_what_trains_here_alone(name, remote, opens, monkeypatch):

@@ -115,21 +115,24 @@ def test_further_models_have_the_recipe_of_their_preset_with_the_words_of_the_ru
 def test_tables_and_pages_say_it():
     config, choices = compose([*PLAIN, "ensemble.members=3"])
     found = build_graph(config, choices)
-    assert found.evaluate.params.method == "3dgs, mean of 3"
+    assert found.evaluate.params.method == "3dgs"  # by which the paper's rows are found
+    assert found.report.params.title == "toycar: 3dgs, smoke, mean of 3"
     assert ("3 models", "ensemble.members=3") in [(what, why[:18]) for what, why in found.report.params.decisions]
     assert shown_values(config)["ensemble.members"] == 3
     alone = build_graph(*compose(PLAIN))
-    assert alone.evaluate.params.method == "3dgs"
+    assert alone.report.params.title == "toycar: 3dgs, smoke"
     assert not any("models" in what for what, _ in alone.report.params.decisions)
     assert not any(key.startswith("ensemble.") for key in shown_values(compose(PLAIN)[0]))
 
 
 def test_pictures_of_another_program_are_those_of_one(tmp_path: Path):
     Image.new("RGB", (4, 4)).save(tmp_path / "view.png")
-    words = ["scene=toycar", "method=external", "ensemble.members=2", f"external.renders={tmp_path}"]
-    assert graph(*words).members == ()
-    assert "mean" not in graph(*words).evaluate.params.method
-    assert not any(key.startswith("ensemble.") for key in shown_values(compose(words)[0]))
+    words = ["scene=toycar", "method=external", f"external.renders={tmp_path}"]
+    with pytest.raises(RtgsError, match=r"ensemble\.members=2 with method=external"):
+        graph(*words, "ensemble.members=2")
+    found = graph(*words, "preset=standard")  # whose ensemble means nothing here
+    assert (found.members, found.moved) == ((), ())
+    assert not any(key.startswith("ensemble.") for key in shown_values(compose([*words, "preset=standard"])[0]))
 
 
 def test_a_plan_lists_them(capsys):
@@ -139,10 +142,27 @@ def test_a_plan_lists_them(capsys):
 
 def test_each_is_expected_to_take_as_long_as_the_runs_own(tmp_path: Path):
     found = graph(*GLASS, "ensemble.members=2")
-    expected = Expectation(Store(tmp_path))
+    store = Store(tmp_path)
     assert found.mesh is not None
     own = [*found.training[:-1], found.mesh, found.training[-1]]
-    assert [expected.seconds(step) for step in found.members] == [expected.seconds(step) for step in own]
+    for number, step in enumerate(own, 1):
+        attempt = store.new_attempt(step.name, step.fingerprint)
+        store.publish(step, attempt, 100.0 * number, 100.0)
+    expected = Expectation(store)
+    assert [expected.seconds(step) for step in found.members] == pytest.approx([100.0, 200.0, 300.0, 400.0])
+
+
+@pytest.mark.parametrize(("method", "models"), [("2dgs", 3), ("envgs", 3), ("rtgs", 2)])
+def test_what_standard_is(method: str, models: int):
+    """The run's own training is the longer one, the others are of ``quick``."""
+    words = ("scene=ball_statue", f"method={method}")
+    found, quick = graph(*words, "preset=standard"), graph(*words, "preset=quick", "scene.long_side=800", "seed=1000")
+    assert len([step for step in found.members if step.name in ("member_1", "member_2", "member_3")]) == models - 1
+    assert [step.params for step in found.members if step.name == "member_1"] == [quick.training[-1].params]
+    assert found.training[-1].params.schedule.total > quick.training[-1].params.schedule.total
+    alone = graph(*words, "preset=standard", "judge=photos")
+    assert alone.members == ()
+    assert graph(*words, "preset=quick").members == ()
 
 
 @pytest.mark.parametrize("members", [-1, 0, 11])
@@ -157,8 +177,9 @@ OTHERS = {"judge=photos": "judge.plain=3dgs", "distill.teachers=2": "distill.tea
 @pytest.mark.parametrize("word", OTHERS)
 def test_other_ways_to_have_several_models_are_refused(word: str):
     words = [*PLAIN[:1], "method=2dgs", "preset=smoke", word]
-    with pytest.raises(RtgsError, match=rf"ensemble\.members=2 with {OTHERS[word]}: give one"):
-        compose([*words, "ensemble.members=2"])
+    for asked in ("ensemble.members=2", "ensemble={members:2}"):
+        with pytest.raises(RtgsError, match=rf"ensemble\.members=2 with {OTHERS[word]}: give one"):
+            compose([*words, asked])
     assert not any("model" in each.what for each in graph(*words).moved)
 
 

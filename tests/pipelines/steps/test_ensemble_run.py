@@ -12,9 +12,12 @@ import pytest
 import torch
 
 from pipelines.cli.main import main
-from pipelines.publishing.exported_run import is_one_set
+from pipelines.publishing.exported_run import export_run
+from pipelines.publishing.results import result_table
 from pipelines.steps.evaluate import _of_all
 from pipelines.steps.training import read_summary
+from rtgs.evaluate.records import read_json
+from rtgs.export.bake import BakeSettings
 from rtgs.gaussians.ply import read_gaussians
 from rtgs.runs.mixture import evaluated
 from rtgs.runs.shown import load
@@ -47,7 +50,7 @@ def test_a_picture_is_the_mean_of_what_the_models_show(together):
         each = [evaluated(method, stage.until, view.camera) for method, stage in models]
         assert not torch.equal(each[0], each[1])
         assert not torch.equal(each[1], each[2])
-        torch.testing.assert_close(tensors["image"], sum(each).clamp(0, 3) / 3, rtol=0, atol=1e-6)
+        torch.testing.assert_close(tensors["image"], torch.stack(each).clamp(0, 1).mean(0), rtol=0, atol=1e-6)
         assert torch.equal(tensors["image_full"], each[0])
         assert not torch.equal(tensors["image_refined_pose"], tensors["image"])
         found = load(together).render(view.camera)
@@ -73,7 +76,7 @@ def test_what_all_models_cost_is_in_the_table(together):
     made = folders(together)
     each = [read_summary(made[name]) for name in ("train_diffuse", "member_1", "member_2")]
     facts = json.loads((together / "metrics.json").read_text())["facts"]
-    assert facts["method"] == "2dgs, mean of 3"
+    assert (facts["method"], facts["models"]) == ("2dgs", 3)
     assert facts["train_seconds"] == pytest.approx(sum(one.seconds for one in each))
     assert facts["train_cpu_seconds"] == pytest.approx(sum(one.cpu_seconds for one in each))
     assert facts["peak_memory_mb"] == max(one.peak_memory_mb for one in each)
@@ -113,11 +116,21 @@ def test_one_more_model_is_the_only_one_that_is_trained(together, root, capture)
     assert {name for name in after if after[name] != before.get(name)} == {"member_3", "render", "evaluate", "report"}
 
 
-def test_one_set_is_fitted_to_the_mean_and_the_file_of_the_run_is_its_own(together):
+def test_one_set_is_fitted_to_the_mean_and_the_file_of_the_run_is_its_own(together, tmp_path):
     run = load(together)
-    assert not is_one_set(run)
+    exported = export_run(run, BakeSettings(steps=3), tmp_path)
+    for camera, layered in zip(exported.cameras, exported.layered, strict=True):
+        assert torch.equal(layered, run.maps(camera)["image"].clamp(0, 1))
+        assert not torch.equal(layered, evaluated(run.method, run.step, camera).clamp(0, 1))
+    assert exported.record.psnr is not None
     own = read_gaussians(together / "point_cloud.ply", channels=())
     assert len(own) == len(run.method.sets[0].gaussians)
+
+
+def test_the_table_of_a_command_says_how_many(together):
+    table = read_json(together / "metrics.json")
+    assert "2dgs, mean of 3" in result_table([table])
+    assert "mean" not in result_table([replace(table, facts=replace(table.facts, models=1))])
 
 
 def test_a_gone_model_is_told(together, root, capture):
