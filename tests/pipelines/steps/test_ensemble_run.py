@@ -7,19 +7,20 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from pipelines.cli.main import main
-from pipelines.publishing.exported_run import export_run
+from pipelines.publishing.exported_run import export_run, has_glass
 from pipelines.publishing.results import result_table
 from pipelines.steps.evaluate import _of_all
 from pipelines.steps.training import read_summary
 from rtgs.evaluate.records import read_json
 from rtgs.export.bake import BakeSettings
 from rtgs.gaussians.ply import read_gaussians
-from rtgs.runs.mixture import evaluated
+from rtgs.runs.mixture import Ensemble, Judged, evaluated
 from rtgs.runs.shown import load
 from rtgs.runs.training import CHECKPOINT_FOLDER, load_method
 from rtgs.runs.views import read_render
@@ -125,6 +126,15 @@ def test_one_set_is_fitted_to_the_mean_and_the_file_of_the_run_is_its_own(togeth
     assert exported.record.psnr is not None
     own = read_gaussians(together / "point_cloud.ply", channels=())
     assert len(own) == len(run.method.sets[0].gaussians)
+
+
+def test_a_file_keeps_the_glass_of_an_ensemble_but_not_where_a_judge_may_have_replaced_it(monkeypatch):
+    """Then walls of glass are no part of the set, but a mesh of their own (docs/export.md)."""
+    monkeypatch.setattr("rtgs.export.glass.glass_part", lambda model: model)
+    replaced = Judged(regions=None, replaced=(0,), plain=None, step=0)
+    for mixture, expected in ((None, True), (Ensemble(()), True), (replaced, False)):
+        assert has_glass(SimpleNamespace(method="with glass", mixture=mixture)) is expected
+    assert not has_glass(SimpleNamespace(method=None, mixture=None))
 
 
 def test_the_table_of_a_command_says_how_many(together):
