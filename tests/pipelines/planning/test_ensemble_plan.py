@@ -9,24 +9,14 @@ import pytest
 from PIL import Image
 
 from pipelines.cli.plan import plan_of_words
-from pipelines.planning.graph import RunGraph, build_graph, shown_values
+from pipelines.planning.graph import build_graph, shown_values
 from rtgs.config import compose
 from rtgs.config.opened import with_configs
 from rtgs.core.errors import RtgsError
-from rtgs.workflow import Step, Store, topological
+from rtgs.workflow import Step, Store
 from rtgs.workflow.expectation import Expectation
 from rtgs.workflow.step import StepContext
-
-PLAIN = ("scene=toycar", "method=3dgs", "preset=smoke")
-GLASS = ("scene=ball_statue", "method=rtgs", "preset=smoke")
-
-
-def graph(*words: str) -> RunGraph:
-    return build_graph(*compose(words))
-
-
-def keys(found: RunGraph) -> dict[str, str]:
-    return {step.name: step.fingerprint for step in topological(found.targets) if step.name != "report"}
+from tests.pipelines.graph_cases import GLASS, PLAIN, graph, keys
 
 
 def known(step: Step) -> dict[str, str]:
