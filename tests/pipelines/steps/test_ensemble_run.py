@@ -143,6 +143,24 @@ def test_the_table_of_a_command_says_how_many(together):
     assert "mean" not in result_table([replace(table, facts=replace(table.facts, models=1))])
 
 
+def test_a_mask_is_for_all_models(together):
+    """With it a run renders a test view to the bit as it was rendered."""
+    seen = []
+
+    class Mixture:
+        def of(self, camera, image, mask=None, options=None):
+            seen.append(mask)
+            return image + 1
+
+    run = replace(load(together), mixture=Mixture())
+    camera = run.scene.test[0].camera
+    mask = torch.ones(camera.height, camera.width, dtype=torch.bool)
+    alone = replace(run, mixture=None).maps(camera, mask)["image"]
+    assert torch.equal(run.maps(camera, mask)["image"], alone + 1)
+    assert len(seen) == 1
+    assert seen[0] is mask
+
+
 def test_a_gone_model_is_told(together, root, capture):
     made = folders(together)
     aside = made["member_2"].with_name("aside")
