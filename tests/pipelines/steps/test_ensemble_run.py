@@ -140,6 +140,7 @@ def test_a_file_keeps_the_glass_of_an_ensemble_but_not_where_a_judge_may_have_re
 def test_the_table_of_a_command_says_how_many(together):
     table = read_json(together / "metrics.json")
     assert "2dgs, mean of 3" in result_table([table])
+    assert (together / "metrics.csv").read_text().count('"2dgs, mean of 3"') == len(table.rows) + 2  # mean and std
     assert "mean" not in result_table([replace(table, facts=replace(table.facts, models=1))])
 
 
