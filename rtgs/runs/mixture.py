@@ -66,7 +66,7 @@ def evaluated(
     from rtgs.methods import Mode, RenderOptions
 
     with torch.no_grad():
-        return method.render(camera, step, Mode.EVALUATE, options or RenderOptions(), mask).image
+        return method.render(camera, step, Mode.EVALUATE, options or RenderOptions(), mask=mask).image
 
 
 class Mixture(Protocol):
