@@ -9,7 +9,7 @@ from rtgs.config.compose import compose_other
 from rtgs.config.convert import models_of, pictures_only, why_one_model
 from rtgs.config.schema import Choices, RunConfig
 from rtgs.core.decisions import Decision
-from rtgs.runs.mixture import member_name
+from rtgs.runs.mixture import is_member, member_name
 from rtgs.train.settings import WatchSettings
 from rtgs.workflow import Step
 
@@ -19,8 +19,12 @@ class Members:
     """The trainings of the further models."""
 
     steps: tuple[Step, ...] = ()  # all of them, in order, with no role: as pages and tables know them
-    last: tuple[Step, ...] = ()  # one of each model: where its training ends
     noted: tuple[Decision, ...] = ()  # what plans and pages say of it
+
+    @property
+    def last(self) -> tuple[Step, ...]:
+        """One of each model: where its training ends."""
+        return tuple(step for step in self.steps if is_member(step.name))
 
 
 def members_of(config: RunConfig, choices: Choices, training: Callable[[RunConfig], tuple[Step, ...]]) -> Members:
@@ -35,13 +39,12 @@ def members_of(config: RunConfig, choices: Choices, training: Callable[[RunConfi
     if count == 1:
         return Members(noted=_why_alone(config))
     method, schedule = compose_other(config.ensemble.preset, choices)
-    chains = []
+    steps: list[Step] = []
     for number in range(1, count):
         own = replace(config, method=method, schedule=schedule, seed=config.other_seed(number), watch=WatchSettings())
-        chains.append(_renamed(training(own), number))
-    steps = tuple(replace(step, role="") for chain in chains for step in chain)
+        steps += (replace(step, role="") for step in _renamed(training(own), number))
     why = f"ensemble.members={count}: pictures are their mean; maps, layers and .ply files are of the run's own"
-    return Members(steps, tuple(chain[-1] for chain in chains), (Decision(f"{count} models", why),))
+    return Members(tuple(steps), (Decision(f"{count} models", why),))
 
 
 def _why_alone(config: RunConfig) -> tuple[Decision, ...]:

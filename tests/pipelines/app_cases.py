@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from pipelines.cli.main import main
 from rtgs.config.names import overridden
 
 WIDTH, HEIGHT, VIEWS = 32, 24, 10
@@ -33,6 +34,15 @@ def folders(run: Path) -> dict[str, Path]:
     """The artifact of each step of a run."""
     steps = json.loads((run / "run.json").read_text())["steps"]
     return {name: run.parents[1] / "store" / name / key[:2] / key for name, key in steps.items()}
+
+
+def finished(root: Path, capture: Path, words: tuple[str, ...], name: str) -> Path:
+    """The folder of a run of this name, for fixtures that many tests share."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(root)
+        patch.setenv("RTGS_ROOT", str(root))
+        assert main(["run", f"scene.path={capture}", *words, f"name={name}"]) == 0
+    return root / "runs" / name
 
 
 def pose(index: int) -> list[list[float]]:

@@ -27,7 +27,7 @@ from rtgs.runs.views import read_render
 from rtgs.scenes.canonical import read_scene
 from rtgs.train.checkpoint import load_checkpoint
 from rtgs.workflow.manifest import Manifest
-from tests.pipelines.app_cases import QUICK, _in_root, capture, folders, root  # noqa: F401  (fixtures)
+from tests.pipelines.app_cases import QUICK, _in_root, capture, finished, folders, root  # noqa: F401  (fixtures)
 
 THREE = ("method=2dgs", "ensemble.members=3", "evaluation.refined_poses=always", "evaluation.refine_steps=2", *QUICK)
 
@@ -35,11 +35,7 @@ THREE = ("method=2dgs", "ensemble.members=3", "evaluation.refined_poses=always",
 @pytest.fixture(scope="module")
 def together(capture, root) -> Path:
     """The folder of a finished run of three models."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(root)
-        patch.setenv("RTGS_ROOT", str(root))
-        assert main(["run", f"scene.path={capture}", *THREE, "name=together"]) == 0
-    return root / "runs" / "together"
+    return finished(root, capture, THREE, "together")
 
 
 def test_a_picture_is_the_mean_of_what_the_models_show(together):

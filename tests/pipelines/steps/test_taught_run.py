@@ -22,7 +22,7 @@ from rtgs.scenes.canonical import read_scene
 from rtgs.train.checkpoint import load_checkpoint
 from rtgs.train.seeds import generator_for
 from rtgs.workflow.manifest import Manifest
-from tests.pipelines.app_cases import QUICK, _in_root, capture, folders, root  # noqa: F401  (fixtures)
+from tests.pipelines.app_cases import QUICK, _in_root, capture, finished, folders, root  # noqa: F401  (fixtures)
 
 TAUGHT = ("method=2dgs", "distill.teachers=2", "distill.views=2", "distill.most=5", *QUICK)
 
@@ -30,11 +30,7 @@ TAUGHT = ("method=2dgs", "distill.teachers=2", "distill.views=2", "distill.most=
 @pytest.fixture(scope="module")
 def taught(capture, root, tmp_path_factory) -> Path:
     """The folder of a finished run."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(root)
-        patch.setenv("RTGS_ROOT", str(root))
-        assert main(["run", f"scene.path={capture}", *TAUGHT, "name=taught"]) == 0
-    return root / "runs" / "taught"
+    return finished(root, capture, TAUGHT, "taught")
 
 
 def test_a_pseudo_view_is_the_mean_of_what_the_teachers_show(taught):
