@@ -12,7 +12,7 @@ from pathlib import Path
 from pipelines.cli.training_picture import picture_of_run
 from pipelines.cli.view_run import viewed
 from pipelines.planning.plan import describe, remote_store
-from pipelines.planning.sweep import Sweep
+from pipelines.planning.sweep import Sweep, worker_job
 from rtgs.config.schema import Choices, RunConfig
 from rtgs.core.errors import RtgsError
 from rtgs.core.memory import share_one_heap
@@ -139,11 +139,26 @@ def _tracked(run: _Run, parent: str) -> RunOutcome:
     with run.tracking.run(replace(info, seconds_before=before, announced=announced)) as tracker:
         track_start(tracker, config, choices, outcomes.as_planned(plan))
         executor = InlineExecutor(run.store, run.tracking, run.remote, onlooker=run.onlooker)
-        results = executor.execute(plan)
+        results = _executed(run, executor)
         folder = write_run_folder(config, choices, run.command, results)
         track_end(tracker, folder, results, executor.artifacts)
     note_tracked(folder, results, run.place)
     return RunOutcome(config, plan, results, folder)
+
+
+def _executed(run: _Run, executor: InlineExecutor) -> tuple[StepResult, ...]:
+    """What the store lacks is run, with processes beside this one where that is sooner. A job of a sweep has none: its
+    launcher spreads the work."""
+    import torch
+
+    from rtgs.workflow.beside import execute_beside, processes_for
+
+    threads = torch.get_num_threads()
+    wanted = run.config.processes or threads
+    processes = 1 if run.membership.sweep or wanted == 1 else processes_for(run.plan, min(wanted, threads))
+    if processes == 1:
+        return executor.execute(run.plan)
+    return execute_beside(executor, run.plan, worker_job(run.config, threads), processes)
 
 
 def open_tracker(config: RunConfig) -> Tracking:

@@ -41,7 +41,7 @@ from pipelines.steps import (
     train,
 )
 from rtgs.config.convert import judged, models_of, pictures_only
-from rtgs.config.schema import Choices, RunConfig
+from rtgs.config.schema import OF_THE_MACHINE, Choices, RunConfig
 from rtgs.core.decisions import Decision
 from rtgs.core.recipe import flatten
 from rtgs.methods import find_method
@@ -69,7 +69,7 @@ KINDS: tuple[StepKind, ...] = (
 )
 """Every kind of step there is; the guard against forgotten version bumps goes through them."""
 
-_NOT_SHOWN = ("paths.", "tracking.", "table.", "name", "threads", "view", "scene.path", "method.paper_schedule.")
+_NOT_SHOWN = ("paths.", "tracking.", "table.", "scene.path", "method.paper_schedule.", *OF_THE_MACHINE)
 _OF_TRAINING = ("method.", "schedule.", "mesh.", "seed", "ablation.", "distill.", "ensemble.")
 
 

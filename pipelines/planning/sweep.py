@@ -21,7 +21,8 @@ from rtgs.core.errors import RtgsError
 from rtgs.track import RunInfo
 from rtgs.track.source import git_tags
 from rtgs.workflow import Plan, RemoteStore, Step, Store, SweepOutcomes, make_plan, topological
-from rtgs.workflow.engine import DaskExecutor, EngineSettings, WorkerJob, open_client
+from rtgs.workflow.engine import DaskExecutor, EngineSettings, open_client
+from rtgs.workflow.worker import WorkerJob
 
 log = logging.getLogger("rtgs")
 Shown = Callable[[MergedJobs, Plan], Mapping[str, str]]
@@ -120,7 +121,8 @@ def run_merged(jobs: Sequence[Job], settings: EngineSettings, shown: Shown) -> S
     settings = settings.for_jobs(len(merged.graphs))  # done or not: who goes on has the threads it began with
     announced = shown(merged, plan)
     with open_client(settings) as client:
-        outcomes = DaskExecutor(client, _worker_job(config, settings), settings.room()).attempt(plan)
+        job = worker_job(config, settings.worker_threads, settings.needs.threads)
+        outcomes = DaskExecutor(client, job, settings.room()).attempt(plan)
     check_arrived(merged.targets, outcomes, store, remote_store(config))
     known = {planned.step.fingerprint: planned for planned in plan}
     return replace(outcomes, planned=known, announced=announced)
@@ -157,14 +159,15 @@ def _common(jobs: Sequence[Job]) -> RunConfig:
     return first
 
 
-def _worker_job(config: RunConfig, settings: EngineSettings) -> WorkerJob:
+def worker_job(config: RunConfig, threads: int, step_threads: Mapping[str, int] | None = None) -> WorkerJob:
+    """What other processes need to work at the steps of a run."""
     tracking = config.tracking
     return WorkerJob(
         str(config.paths.store),
-        settings.worker_threads,
+        threads,
         config.paths.remote,
         tracking.kind,
         str(Path(config.paths.root)),
         tracking.uri,
-        dict(settings.needs.threads),
+        dict(step_threads or {}),
     )

@@ -131,7 +131,7 @@ def _summary(inputs: Mapping[str, Path]) -> TrainSummary | None:
 
 
 def _of_all(own: TrainSummary, inputs: Mapping[str, Path]) -> TrainSummary:
-    """What all models of an ensemble cost, trained one after the other, and their surfels together."""
+    """What all models of an ensemble cost, whether or not trained at once, and their surfels together."""
     models = [own]
     for number in range(1, len(members_of(inputs)) + 1):
         mesh = inputs.get(member_name(number, MESH_STEP))

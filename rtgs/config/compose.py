@@ -9,7 +9,7 @@ from omegaconf import DictConfig
 
 from rtgs.config.convert import to_run_config, with_own
 from rtgs.config.opened import opened_configs
-from rtgs.config.schema import Choices, RunConfig, register_schema
+from rtgs.config.schema import OF_THE_MACHINE, Choices, RunConfig, register_schema
 from rtgs.config.steps import scaled_steps
 from rtgs.config.words import unresolved
 from rtgs.core.build import build
@@ -112,7 +112,7 @@ def choices_from(groups: Mapping[str, object], overrides: Sequence[str]) -> Choi
     """
     names = {str(key): str(value) for key, value in groups.items() if value is not None}
     chosen = {key: names.get(key, "") for key in ("method", "preset", "ablation", "experiment")}
-    told_otherwise = {*names, "hydra", "paths.root", "name", "threads", "view"} - {"sfm", "masks", "normals", "judge"}
+    told_otherwise = {*names, "hydra", "paths.root", *OF_THE_MACHINE} - {"sfm", "masks", "normals", "judge"}
     elsewhere = ("tracking.", "viewer.")
     keys = [
         item

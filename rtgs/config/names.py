@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rtgs.config.keys import short_key
-from rtgs.config.schema import Choices
+from rtgs.config.schema import OF_THE_MACHINE, Choices
 
 LONGEST_OVERRIDES = 60  # characters of a run's name
 LONGEST_VALUE = 24
@@ -16,7 +16,7 @@ _UNTELLING = {"images", "input", "rgb", "sparse", "colmap", "0", "data", "dense"
 # Where results go, what has its own place in the name, and what does not change them.
 _NOT_NAMED = ("paths.", "tracking.", "table.", "watch.", "viewer.", "hydra.", "hydra/")
 _ELSEWHERE = {"scene", "method", "preset", "ablation", "experiment", "tracking", "judge"}
-_ELSEWHERE |= {"external.name", "seed", "name", "threads", "view", "scene.path", "scene.name"}
+_ELSEWHERE |= {"external.name", "seed", "scene.path", "scene.name", *OF_THE_MACHINE}
 
 
 def derive_name(path: str) -> str:

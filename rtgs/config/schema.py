@@ -230,10 +230,14 @@ class RunConfig:
     """Folder under ``<root>/runs``. None: scene, method, preset, ablation and seed."""
     threads: int | None = None
     """Threads of torch and the native core. None: torch's default."""
+    processes: int | None = None
+    """Trainings of one run that do not wait for each other (of further models, of teachers) pass at once in so many
+    processes, which share the threads. None: as many as there are such trainings, threads and memory for."""
 
     def __post_init__(self) -> None:
         refuse_below("seed", self.seed, 0)
         refuse_below("threads", self.threads, 1)
+        refuse_below("processes", self.processes, 1)
         scaler = self.steps_scaler
         refuse_unless(0 < scaler < math.inf, "steps_scaler", scaler, "above 0 and finite")
         refuse_unless(self.threads is None or self.threads <= _MOST_THREADS, "threads", self.threads, "at most 1024")
@@ -243,6 +247,7 @@ class RunConfig:
         return self.seed + _APART * number
 
 
+OF_THE_MACHINE = ("name", "threads", "processes", "view")  # of RunConfig: no part of what a run is
 _APART = 1000  # between the seeds of models of one run: those of a sweep over seeds stay apart
 _MOST_THREADS = 1024  # no machine has more cores
 

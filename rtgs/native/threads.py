@@ -20,11 +20,29 @@ Result = TypeVar("Result")
 SERIAL_PIXELS = 1 << 18  # of a picture, up to which waking threads costs torch's operations more than it brings
 
 _kernels: ContextVar[int | None] = ContextVar("kernels", default=None)  # None: as many as torch
+_lent: ContextVar[Callable[[], int] | None] = ContextVar("lent", default=None)  # None: others have nothing to lend
 
 
 def threads() -> int:
-    """Of every kernel: as many as torch has, or had before :func:`serial_torch`."""
+    """Of every kernel: as many as torch has, or had before :func:`serial_torch`, in which another process of the run
+    may have lent more (:func:`borrow`). No bit of a kernel's result depends on it."""
+    own, lent = _kernels.get(), _lent.get()
+    return settled_threads() if own is None or lent is None else max(own, lent())
+
+
+def settled_threads() -> int:
+    """The same without what others lend: what results may depend on, through torch's own operations."""
     return _kernels.get() or torch.get_num_threads()
+
+
+@contextmanager
+def borrow(now: Callable[[], int]) -> Iterator[None]:
+    """While the block runs, kernels in :func:`serial_torch` take as many threads as ``now`` says, if that is more."""
+    before = _lent.set(now)
+    try:
+        yield
+    finally:
+        _lent.reset(before)
 
 
 @contextmanager
@@ -34,7 +52,7 @@ def serial_torch(wanted: bool = True) -> Iterator[None]:
     if not wanted:
         yield
         return
-    before = _kernels.set(threads())
+    before = _kernels.set(settled_threads())
     try:
         with _torch_threads(1):
             yield
@@ -58,7 +76,7 @@ def in_threads(work: Callable[..., Result], *items: Iterable) -> list[Result]:
 @contextmanager
 def threaded_torch() -> Iterator[None]:
     """While the block runs, torch's own operations take as many threads as the kernels: for networks."""
-    with _torch_threads(threads()):
+    with _torch_threads(settled_threads()):
         yield
 
 

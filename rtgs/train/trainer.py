@@ -15,7 +15,7 @@ from rtgs.core.decisions import Decision
 from rtgs.core.memory import hand_back
 from rtgs.core.version import VERSION
 from rtgs.native import core
-from rtgs.native.threads import SERIAL_PIXELS, serial_torch, threads
+from rtgs.native.threads import SERIAL_PIXELS, serial_torch, settled_threads
 from rtgs.scenes.scene import Scene
 from rtgs.train.checkpoint import (
     Checkpoint,
@@ -379,7 +379,7 @@ class Trainer:
             step=self._step,
             settings_digest=digest(self._settings),
             scene_digest=self._scene_digest,
-            threads=threads(),
+            threads=settled_threads(),
             isa=core.isa(),
             versions=(("rtgs", VERSION), ("torch", torch.__version__), ("python", platform.python_version())),
             elapsed=elapsed.wall,

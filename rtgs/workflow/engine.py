@@ -18,17 +18,16 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from rtgs.core.errors import RtgsError
 from rtgs.core.refuse import refuse_unknown_words
-from rtgs.track import TrackingKind, open_tracking
-from rtgs.workflow.executors import IF_MEMORY, InlineExecutor
+from rtgs.workflow.executors import IF_MEMORY
 from rtgs.workflow.outcome import StepOutcome, SweepOutcomes
 from rtgs.workflow.plan import Plan
 from rtgs.workflow.progress import plan_progress
-from rtgs.workflow.remote import RemoteStore
 from rtgs.workflow.resources import Room, StepNeeds, by_step, bytes_of
 from rtgs.workflow.spread import best_spread, machine_cores, machine_memory
 from rtgs.workflow.step import Step
 from rtgs.workflow.store import Store
 from rtgs.workflow.wire import TlsFiles, check_tls, tls_config
+from rtgs.workflow.worker import WorkerJob, run_step
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -170,19 +169,6 @@ class EngineSettings:
         return max(1, machine_cores() // self.worker_limit) if self.kind == "local" else 1
 
 
-@dataclass(frozen=True)
-class WorkerJob:
-    """Everything a worker needs besides the step; plain data."""
-
-    store: str
-    threads: int
-    remote: str = field(default="", repr=False)  # Dask logs what a task was given
-    tracking: TrackingKind = "off"
-    tracking_root: str = "."
-    tracking_uri: str = field(default="", repr=False)  # likewise
-    step_threads: Mapping[str, int] = field(default_factory=dict)
-
-
 class DaskExecutor:
     """The plan as a graph of Dask tasks on the workers of ``client``."""
 
@@ -236,20 +222,6 @@ def _cached(plan: Plan, store: Store) -> Iterator[tuple[str, StepOutcome]]:
         if planned.hit and (artifact := store.find(step)):
             folder, duration = artifact.folder, artifact.manifest.duration
             yield step.fingerprint, StepOutcome(step.name, step.fingerprint, folder, duration, False)
-
-
-def run_step(step: Step, job: WorkerJob, before: list[StepOutcome]) -> StepOutcome:
-    """On a worker: one step whose upstream is in the store, or in the remote one."""
-    import torch
-
-    torch.set_num_threads(job.step_threads.get(step.needs_of, job.threads))
-    tracking = open_tracking(job.tracking, Path(job.tracking_root), job.tracking_uri)
-    remote = RemoteStore(job.remote) if job.remote else None
-    executor = InlineExecutor(Store(Path(job.store)), tracking, remote, quiet=True)
-    if not any(outcome.failed for outcome in before):
-        for other in step.upstream:  # on a machine without the shared disk it comes from the remote store
-            executor.outcome(other, "", ())
-    return executor.outcome(step, f"[{os.uname().nodename} {os.getpid()}]", before)
 
 
 def _outcome(future: Any) -> StepOutcome:

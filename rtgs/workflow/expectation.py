@@ -12,6 +12,7 @@ from typing import Any
 
 from rtgs.workflow.manifest import Manifest
 from rtgs.workflow.plan import Plan
+from rtgs.workflow.spread import training_time
 from rtgs.workflow.step import Step
 from rtgs.workflow.store import Store
 
@@ -26,6 +27,7 @@ SECONDS = {
 SECONDS |= {"judge": 4.0, "render": 4.0, "evaluate": 4.0, "report": 3.0}
 """What a step takes on two cores with photos of 256x192, where none of its kind was ever run here. Larger ones take
 longer."""
+_TABLE_THREADS = 2
 OTHER_SECONDS = 10.0
 TRAINING_STEP_SECONDS = {"plain": 0.015, "train_diffuse": 0.015, "train_reflection": 0.06, "train_shading": 0.06}
 TRAINING_STEP_SECONDS |= {"train_transmittance": 0.1}
@@ -44,8 +46,9 @@ def training_steps(params: Mapping[str, Any]) -> int | None:
 class Expectation:
     """Seconds a step will take, by the median of the runs of its kind that resemble it most."""
 
-    def __init__(self, store: Store) -> None:
-        self._store = store
+    def __init__(self, store: Store, threads: int = 0) -> None:
+        """``threads``: that each training will have; 0: as many as those that are recorded."""
+        self._store, self._threads = store, threads
         self._recorded: dict[str, list[Manifest]] = {}
 
     def seconds(self, step: Step) -> float:
@@ -57,13 +60,22 @@ class Expectation:
             self._recorded[name] = [artifact.manifest for artifact in self._store.artifacts(name)]
         count, recorded = training_steps(step.recipe), self._recorded[name]
         if not recorded:
-            return _from_table(name, count)
+            return _from_table(name, count) * self._slower(_TABLE_THREADS if count else 0)
         method = _method(step.recipe)
         alike = [manifest for manifest in recorded if _method(manifest.params) == method] or recorded
         if count is None:
             return statistics.median(manifest.duration for manifest in alike)
-        pace = [manifest.duration / max(training_steps(manifest.params) or count, 1) for manifest in alike]
-        return count * statistics.median(pace)
+        return count * statistics.median(self._pace(manifest, count) for manifest in alike)
+
+    def _pace(self, manifest: Manifest, count: int) -> float:
+        """Seconds a training step, with the threads that it will have."""
+        then = manifest.machine.get("threads")
+        slower = self._slower(then if isinstance(then, int) else 0)
+        return slower * manifest.duration / max(training_steps(manifest.params) or count, 1)
+
+    def _slower(self, then: int) -> float:
+        """How much longer a training takes than with ``then`` threads; 0: nobody knows, or it is no training."""
+        return training_time(self._threads) / training_time(then) if self._threads and then else 1.0
 
 
 def _from_table(name: str, count: int | None) -> float:
@@ -90,6 +102,7 @@ class PlanClock:
         self.weights = {step.fingerprint: max(expectation.seconds(step), 0.01) for step in todo}
         self._left = dict(self.weights)
         trainings = (step for step in todo if training_steps(step.recipe) is not None)
+        self._after = [(step.fingerprint, [other.fingerprint for other in step.upstream]) for step in todo]
         self._tells = {step.fingerprint for step in trainings if not step.name.endswith(_REST)}
         self._lanes = max(1, lanes)
         self._now = now
@@ -118,8 +131,17 @@ class PlanClock:
 
     def left(self) -> float:
         """Seconds until everything is done, as far as one can tell."""
-        rest = sum(self._left.values()) * self._took / self._expected / min(self._lanes, max(len(self._left), 1))
+        shared = sum(self._left.values()) / min(self._lanes, max(len(self._left), 1))
+        rest = max(shared, self._longest()) * self._took / self._expected
         return max(rest - (self._now() - self._since), 0.0)
+
+    def _longest(self) -> float:
+        """Expected seconds of the steps left that wait for each other: no number of lanes brings them sooner."""
+        until: dict[str, float] = {}
+        for fingerprint, upstream in self._after:  # upstream first
+            before = max((until.get(other, 0.0) for other in upstream), default=0.0)
+            until[fingerprint] = before + self._left.get(fingerprint, 0.0)
+        return max(until.values(), default=0.0)
 
 
 def spoken(seconds: float) -> str:

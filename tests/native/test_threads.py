@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from rtgs.native import core
-from rtgs.native.threads import in_threads, serial_torch, threaded_torch, threads
+from rtgs.native.threads import borrow, in_threads, serial_torch, settled_threads, threaded_torch, threads
 from tests.render.native_scene import SCENE_OPTIONS, native_scene
 from tests.render.native_trace_scene import everything, native_trace_scene
 
@@ -316,3 +316,26 @@ def test_work_in_threads_keeps_its_order_and_tells_what_went_wrong():
         in_threads(lambda a, b: a, [1, 2, 3], [1])
     with pytest.raises(ZeroDivisionError):
         in_threads(lambda a: 1 / a, [2, 1, 0])
+
+
+def test_lent_threads_are_for_kernels_alone():
+    """Torch's own operations, whose bits may depend on their number, never have them."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    lent = 1
+    try:
+        with borrow(lambda: lent):
+            assert threads() == 2  # nobody takes away what a process has
+            with serial_torch():
+                assert threads() == 2
+                lent = 5
+                assert (threads(), settled_threads(), torch.get_num_threads()) == (5, 2, 1)
+                with threaded_torch():
+                    assert torch.get_num_threads() == 2
+                with serial_torch():
+                    assert settled_threads() == 2
+            assert threads() == settled_threads() == torch.get_num_threads() == 2
+        with serial_torch():
+            assert threads() == 2
+    finally:
+        torch.set_num_threads(before)

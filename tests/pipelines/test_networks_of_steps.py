@@ -17,7 +17,7 @@ from rtgs.pretrained.weights import LPIPS_VGG, VGG16
 from rtgs.runs.training import StageParams
 from rtgs.train.settings import LossSettings
 from rtgs.workflow import InlineExecutor, Store, make_plan
-from rtgs.workflow.engine import WorkerJob, run_step
+from rtgs.workflow.worker import WorkerJob, run_step
 from tests.pipelines.app_cases import QUICK, _in_root, capture, root  # noqa: F401  (fixtures)
 from tests.train.training_cases import small_schedule
 

@@ -21,7 +21,8 @@ from rtgs.runs.training import load_method
 from rtgs.runs.views import read_render
 from rtgs.scenes.canonical import read_scene
 from rtgs.workflow import InlineExecutor, Store, make_plan
-from rtgs.workflow.engine import DaskExecutor, EngineSettings, WorkerJob, open_client
+from rtgs.workflow.engine import DaskExecutor, EngineSettings, open_client
+from rtgs.workflow.worker import WorkerJob
 
 NAME = "two_stage_method:SPEC"
 STATE = Path("checkpoint") / "state.safetensors"

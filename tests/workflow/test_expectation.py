@@ -128,3 +128,34 @@ def test_steps_in_this_process_say_what_is_left_of_the_plan(tmp_path, caplog):
 
 def test_times_as_people_say_them():
     assert [spoken(seconds) for seconds in (6.6, 750, 11100)] == ["0:07", "12:30", "3:05:00"]
+
+
+def test_a_training_takes_longer_with_fewer_threads(tmp_path):
+    store, step = Store(tmp_path), training("2dgs", 1000)
+    assert Expectation(store, 2).seconds(step) == pytest.approx(15)  # the table is of two
+    assert Expectation(store, 1).seconds(step) == pytest.approx(15 * 1.6)
+    folder = store.folder(training("2dgs", 100))
+    folder.mkdir(parents=True)
+    manifest = describe(training("2dgs", 100), folder, 10.0, "2026-01-01T00:00:00+00:00")
+    replace(manifest, machine={"threads": 1}).write(folder)
+    assert Expectation(store, 1).seconds(step) == pytest.approx(100)
+    assert Expectation(store, 2).seconds(step) == pytest.approx(100 / 1.6)
+    assert Expectation(store).seconds(step) == pytest.approx(100)
+    replace(manifest, machine={}).write(folder)
+    assert Expectation(store, 2).seconds(step) == pytest.approx(100)
+    masks = Step("masks", 1, ToyParams(1.0), train)
+    assert Expectation(store, 1).seconds(masks) == Expectation(store).seconds(masks)
+
+
+def test_lanes_do_not_shorten_what_waits_for_each_other(tmp_path):
+    store = Store(tmp_path)
+    first, *others = (training("2dgs", until) for until in (2000, 200, 400))
+    after = replace(training("2dgs", 3000), upstream=(first,))
+    clock = PlanClock(make_plan((after, *others), store), Expectation(store), lanes=2, now=lambda: 0.0)
+    assert clock.left() == pytest.approx(30 + 45)  # of 84 in all
+    clock.finish(first.fingerprint, 30.0)
+    assert clock.left() == pytest.approx(45)
+    clock.finish(after.fingerprint, 45.0)
+    assert clock.left() == pytest.approx(6)  # the longer of two
+    several = make_plan([training("2dgs", 200, seed) for seed in range(4)], store)
+    assert PlanClock(several, Expectation(store), lanes=2, now=lambda: 0.0).left() == pytest.approx(12 / 2)

@@ -55,6 +55,25 @@ def test_a_picture_is_the_mean_of_what_the_models_show(together):
         assert torch.equal(found.depth, tensors["depth"])
 
 
+def test_models_trained_side_by_side_are_the_same(together, capture, tmp_path, capfd):
+    words = [word for word in THREE if word != "threads=1"]
+    beside = folders(finished(tmp_path, capture, (*words, "threads=2"), "together"))
+    lines = capfd.readouterr().err.splitlines()
+    (first, *_) = (line for line in lines if line.endswith("in a process beside this one"))
+    assert "member_1" in first
+    assert any(line.startswith("member_1: diffuse: step 12/12") for line in lines)
+    one_by_one = folders(together)
+    assert beside.keys() == one_by_one.keys()
+    for name in ("train_diffuse", "member_1", "member_2"):
+        models = (load_checkpoint(made[name] / CHECKPOINT_FOLDER).tensors for made in (beside, one_by_one))
+        same, own = (dict(tensors) for tensors in models)
+        assert same.keys() == own.keys()
+        assert all(torch.equal(same[key], own[key]) for key in own)
+    first, second = (sorted(made["render"].glob("**/*.safetensors")) for made in (beside, one_by_one))
+    assert [path.read_bytes() for path in first] == [path.read_bytes() for path in second]
+    assert first
+
+
 def test_its_squared_error_is_below_the_mean_of_theirs(together):
     """By what the pictures differ: the mean of the squared distances to their mean."""
     made = folders(together)

@@ -1,0 +1,261 @@
+"""Trainings of one run in several processes: each step once, the same results, and nobody outlives the run."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+import torch
+
+from rtgs.native.threads import serial_torch, settled_threads, threads
+from rtgs.workflow import NOT_IN_RECIPE, InlineExecutor, Plan, Step, StepContext, StepFailed, Store, beside, make_plan
+from rtgs.workflow.beside import execute_beside, processes_for
+from rtgs.workflow.worker import WorkerJob
+
+PATIENCE = 60.0
+
+
+@dataclass(frozen=True)
+class Training:
+    name: str
+    from_step: int = 0
+    until: int = 10
+    waits_for: tuple[str, ...] = field(default=(), metadata=NOT_IN_RECIPE)  # marks to be there before it ends
+    root: str = field(default="", metadata=NOT_IN_RECIPE)
+
+
+@dataclass(frozen=True)
+class Other:
+    name: str
+    root: str = field(default="", metadata=NOT_IN_RECIPE)
+
+
+def mark(root: str, name: str, text: str = "") -> None:
+    path = Path(root) / name
+    path.with_suffix(".tmp").write_text(text)
+    path.with_suffix(".tmp").rename(path)
+
+
+def wait_for(path: Path) -> None:
+    until = time.monotonic() + PATIENCE
+    while not path.exists():
+        assert time.monotonic() < until, f"{path.name} never came"
+        time.sleep(0.01)
+
+
+def train(params: Training, context: StepContext) -> None:
+    """Writes down who and how it is; ends when what it waits for is there."""
+    with open(Path(params.root) / "log", "a", encoding="utf-8") as stream:
+        stream.write(f"{params.name}\n")
+    mark(params.root, f"{params.name}-began", str(os.getpid()))
+    (context.partial / "checkpoint").write_text(params.name)
+    for name in params.waits_for:
+        wait_for(Path(params.root) / name)
+    facts = {"pid": os.getpid(), "threads": torch.get_num_threads(), "inputs": sorted(context.inputs)}
+    (context.out / "facts.json").write_text(json.dumps(facts))
+
+
+def train_with_kernels(params: Training, context: StepContext) -> None:
+    """As a training has it; ends when its kernels have both threads."""
+    with serial_torch():
+        assert (threads(), settled_threads()) == (1, 1) or not params.waits_for
+        train(params, context)
+        until = time.monotonic() + PATIENCE
+        while threads() < 2:
+            assert time.monotonic() < until, "no thread was lent"
+            time.sleep(0.01)
+        assert settled_threads() == 1
+
+
+def train_in_vain(params: Training, context: StepContext) -> None:
+    train(params, context)
+    raise ValueError(f"{params.name} cannot be trained")
+
+
+def train_and_die(params: Training, context: StepContext) -> None:
+    """Killed the first time."""
+    first = not (context.partial / "checkpoint").exists()
+    train(params, context)
+    if first:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def other(params: Other, context: StepContext) -> None:
+    facts = {"pid": os.getpid(), "threads": torch.get_num_threads(), "executed": len(context.executed)}
+    (context.out / "facts.json").write_text(json.dumps(facts))
+
+
+def training(root: Path, name: str, *upstream: Step, waits_for: tuple[str, ...] = (), run=train) -> Step:
+    return Step(name, 1, Training(name, waits_for=waits_for, root=str(root)), run, upstream)
+
+
+def crossed(root: Path, run=train) -> tuple[Step, Step, Step]:
+    """A capture and two trainings, each of which ends only once the other has begun."""
+    capture = Step("capture", 1, Other("capture"), other)
+    one = training(root, "train_own", capture, waits_for=("member_1-began",), run=run)
+    two = training(root, "member_1", capture, waits_for=("train_own-began",))
+    return capture, one, two
+
+
+def execute(root: Path, plan: Plan, processes: int = 2, threads: int = 2):
+    store = Store(root / "store")
+    return execute_beside(InlineExecutor(store), plan, WorkerJob(str(store.root), threads), processes)
+
+
+def facts(result) -> dict:
+    return json.loads((result.folder / "facts.json").read_text())
+
+
+def trained(root: Path) -> list[str]:
+    return sorted((root / "log").read_text().split())
+
+
+@pytest.fixture(autouse=True)
+def _threads():
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    assert torch.get_num_threads() == 2
+    torch.set_num_threads(before)
+
+
+def is_there(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return not Path(f"/proc/{pid}/stat").exists() or Path(f"/proc/{pid}/stat").read_text().split()[2] != "Z"
+
+
+def test_two_trainings_pass_at_once(tmp_path):
+    capture, one, two = crossed(tmp_path)
+    page = Step("page", 1, Other("page"), other, (one, two))
+    store = Store(tmp_path / "store")
+    plan = make_plan((page,), store)
+    results = execute(tmp_path, plan)
+    assert [result.step for result in results] == [capture, one, two, page]
+    assert all(result.executed and store.find(result.step) for result in results)
+    pids = [facts(result)["pid"] for result in results]
+    assert pids[0] == pids[1] == pids[3] == os.getpid() != pids[2]
+    assert [facts(result)["threads"] for result in results] == [2, 1, 1, 2]
+    assert facts(results[3])["executed"] == 3
+    assert trained(tmp_path) == ["member_1", "train_own"]
+    assert not is_there(pids[2])
+    again = execute(tmp_path, make_plan((page,), store))
+    assert [result.folder for result in again] == [result.folder for result in results]
+    assert not any(result.executed for result in again)
+
+
+def test_what_another_does_not_need_is_lent(tmp_path):
+    """Both ways: each of these trainings ends only when its kernels may have both threads."""
+    long = training(tmp_path, "train_own", waits_for=("short-began",), run=train_with_kernels)
+    short = training(tmp_path, "short", waits_for=("train_own-began",))
+    results = execute(tmp_path, make_plan((long, short), Store(tmp_path / "store")))
+    assert [facts(result)["threads"] for result in results] == [1, 1]  # of torch, as in serial_torch
+    short = training(tmp_path, "train_short", waits_for=("long-began",))
+    long = training(tmp_path, "long", waits_for=("train_short-began",), run=train_with_kernels)
+    results = execute(tmp_path, make_plan((short, long), Store(tmp_path / "store")))
+    assert facts(results[0])["pid"] == os.getpid() != facts(results[1])["pid"]
+
+
+def test_a_training_that_waits_for_another_goes_on_where_that_was(tmp_path):
+    """Meshes between trainings too; other steps stay with the run."""
+    capture, one, two = crossed(tmp_path)
+    mesh = Step("member_1_extract_mesh", 1, Other("mesh"), other, (two,), kind="extract_mesh")
+    later = training(tmp_path, "member_2", mesh)
+    one = training(tmp_path, "train_own", capture, waits_for=("member_2-began",))
+    page = Step("page", 1, Other("page"), other, (two,))
+    results = execute(tmp_path, make_plan((one, later, page), Store(tmp_path / "store")))
+    by_name = {result.step.name: facts(result)["pid"] for result in results}
+    assert by_name["member_1"] == by_name["member_1_extract_mesh"] == by_name["member_2"] != os.getpid()
+    assert by_name["page"] == by_name["train_own"] == os.getpid()
+
+
+@pytest.mark.parametrize("failing", ["train_own", "member_1"])
+def test_an_error_of_either_ends_the_run(tmp_path, failing, caplog):
+    capture, one, two = crossed(tmp_path)
+    endless = ("never",) if failing == "train_own" else ()
+    two = training(tmp_path, "member_1", capture, waits_for=("train_own-began", *endless), run=two.run)
+    if failing == "train_own":
+        one = training(tmp_path, "train_own", capture, waits_for=("member_1-began",), run=train_in_vain)
+    else:
+        two = training(tmp_path, "member_1", capture, waits_for=("train_own-began",), run=train_in_vain)
+    page = Step("page", 1, Other("page"), other, (one, two))
+    store = Store(tmp_path / "store")
+    with pytest.raises(StepFailed, match=f"{failing} .* failed: ValueError: {failing} cannot be trained"):
+        execute(tmp_path, make_plan((page,), store))
+    assert store.find(page) is None
+    assert (store.find(one) is None) == (failing == "train_own")
+    assert (store.partial(two) / "checkpoint").read_text() == "member_1"
+    assert not is_there(int((tmp_path / "member_1-began").read_text()))
+
+
+def test_what_a_killed_process_was_at_is_done_by_the_run(tmp_path, caplog):
+    capture, one, two = crossed(tmp_path)
+    two = training(tmp_path, "member_1", capture, waits_for=("train_own-began",), run=train_and_die)
+    with caplog.at_level(logging.WARNING, "rtgs.workflow"):
+        results = execute(tmp_path, make_plan((one, two), Store(tmp_path / "store")))
+    assert all(result.executed for result in results)
+    assert facts(results[2])["pid"] == os.getpid()
+    assert trained(tmp_path) == ["member_1", "member_1", "train_own"]
+    assert any("was killed" in record.getMessage() and two.label in record.getMessage() for record in caplog.records)
+
+
+def test_no_process_outlives_a_run_that_was_killed(tmp_path):
+    script = (
+        "import sys, pathlib; sys.path.insert(0, sys.argv[2]); import test_beside as t\n"
+        "if __name__ == '__main__':\n"
+        "    root = pathlib.Path(sys.argv[1])\n"
+        "    one = t.training(root, 'train_own', waits_for=('never',))\n"
+        "    two = t.training(root, 'member_1', waits_for=('never',))\n"
+        "    t.execute(root, t.make_plan((one, two), t.Store(root / 'store')))\n"
+    )
+    (tmp_path / "run.py").write_text(script)
+    run = subprocess.Popen([sys.executable, str(tmp_path / "run.py"), str(tmp_path), str(Path(__file__).parent)])
+    try:
+        wait_for(tmp_path / "member_1-began")
+        helper = int((tmp_path / "member_1-began").read_text())
+        assert is_there(helper)
+        assert helper != run.pid
+    finally:
+        run.kill()
+        run.wait()
+    until = time.monotonic() + PATIENCE
+    while is_there(helper):
+        assert time.monotonic() < until
+        time.sleep(0.02)
+
+
+def test_as_many_processes_as_trainings_that_can_begin(tmp_path, monkeypatch):
+    monkeypatch.setattr(beside, "machine_cores", lambda: 16)
+    monkeypatch.setattr(beside, "machine_memory", lambda: 64 * 2.0**30)
+    store = Store(tmp_path / "store")
+    capture = Step("capture", 1, Other("capture"), other)
+    first = [training(tmp_path, f"member_{number}", capture) for number in range(3)]
+    later = training(tmp_path, "train_own", *first)
+    page = Step("page", 1, Other("page"), other, (later,))
+    after = training(tmp_path, "train_after", page)
+    plan = make_plan((after,), store)
+    assert processes_for(plan, 16) == 3
+    assert processes_for(plan, 2) == 2
+    monkeypatch.setattr(beside, "machine_memory", lambda: 5 * 2.0**30)
+    assert processes_for(plan, 16) == 2
+    monkeypatch.setattr(beside, "machine_memory", lambda: 1e9)
+    assert processes_for(plan, 16) == 1
+    monkeypatch.setattr(beside, "machine_memory", lambda: 0.0)  # Dask is not there to ask: the memory of the machine
+    assert processes_for(plan, 16) >= 1
+    monkeypatch.setattr(beside, "machine_memory", lambda: 64 * 2.0**30)
+    monkeypatch.setattr(beside, "machine_cores", lambda: 1)
+    assert processes_for(plan, 16) == 1
+    monkeypatch.setattr(beside, "machine_cores", lambda: 16)
+    assert processes_for(make_plan((capture,), store), 16) == 1
+    InlineExecutor(store).execute(make_plan(first[:2], store))
+    assert processes_for(make_plan((after,), store), 16) == 1
