@@ -69,8 +69,8 @@ $(READY_DEV): $(READY)
 	@touch $(READY_DEV)
 	@echo "$(VENV) takes $$(du -sh $(VENV) | cut -f1)B"
 
-demo: setup ## train the embedded glass scene, end with a page of pictures and numbers (about 3 minutes)
-	$(BIN)/rtgs run scene=demo method=rtgs preset=quick $(RUN)
+demo: setup ## train the embedded glass scene, end with a page of pictures and numbers (a minute and a half)
+	$(BIN)/rtgs run scene=demo method=rtgs preset=quick steps_scaler=0.5 $(RUN)
 
 reproduce-table1: setup ## mirrors: every method on every scene, ends with tables/table1-PRESET (PRESET= SEEDS= DATA= WORKERS=)
 	$(call of_data,ref_real)$(CHECK_DATA)

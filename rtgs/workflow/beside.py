@@ -147,8 +147,9 @@ class _Board:
     def take_beside(self) -> Step | None:
         """The next step that a helper may have now."""
         with self.changed:
-            step = next((step for step in self._waiting if _worth(step) and self._is_ready(step)), None)
-            if step is None or not self._is_to_do(step):
+            left = (step for step in self._waiting if _worth(step) and self._is_to_do(step))
+            step = next((step for step in left if self._is_ready(step)), None)
+            if step is None:
                 return None
             self._waiting.remove(step)
             self._beside[step.fingerprint] = step
@@ -213,11 +214,10 @@ class _Helpers:
                 result = replace(future.result(), step=step)  # not its copy
             except (BrokenExecutor, CancelledError):
                 self._lost(step)
-            except StepFailed as error:
-                log.error("%s", error)
-                self._board.leave(step, failed=error)
             except Exception as error:
-                self._board.leave(step, failed=StepFailed(step, error))
+                failed = error if isinstance(error, StepFailed) else StepFailed(step, error)
+                log.error("%s; the run ends with the step that it is at", failed)
+                self._board.leave(step, failed=failed)
             else:
                 self._free += 1
                 self._board.leave(step, result)

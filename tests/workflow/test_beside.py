@@ -179,6 +179,17 @@ def test_a_training_that_waits_for_another_goes_on_where_that_was(tmp_path):
     assert by_name["page"] == by_name["train_own"] == os.getpid()
 
 
+def test_what_is_in_the_store_keeps_nobody_from_what_is_not(tmp_path):
+    """A cached training comes before the one that another process can take, which its capture's reader waits for."""
+    capture, one, two = crossed(tmp_path)
+    store = Store(tmp_path / "store")
+    done = [training(tmp_path, f"member_{number}", capture) for number in (7, 8)]
+    InlineExecutor(store).execute(make_plan(done, store))
+    results = execute(tmp_path, make_plan((one, *done, two), store))
+    assert [result.executed for result in results] == [False, True, False, False, True]
+    assert facts(results[1])["pid"] == os.getpid() != facts(results[4])["pid"]
+
+
 @pytest.mark.parametrize("failing", ["train_own", "member_1"])
 def test_an_error_of_either_ends_the_run(tmp_path, failing, caplog):
     capture, one, two = crossed(tmp_path)
