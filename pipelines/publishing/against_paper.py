@@ -11,7 +11,7 @@ from pipelines.steps.training import read_summary
 from rtgs.config.compose import compose
 from rtgs.config.convert import pictures_only
 from rtgs.config.locate import choices_of, conf_dir
-from rtgs.config.schema import RunConfig
+from rtgs.config.schema import OF_THE_MACHINE, RunConfig
 from rtgs.core.documents import load_yaml
 from rtgs.core.recipe import flatten
 from rtgs.methods import find_method
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 PRINTED = {"rtgs": "rtgs_printed"}  # the method that is another one's paper; the others are their own with preset=paper
 # Where results go, what is measured, and where this machine has its files: no part of a method.
 _OUTSIDE = (
-    *("paths.", "tracking.", "table.", "evaluation.", "ablation.", "name", "threads", "view", "method.name"),
+    *("paths.", "tracking.", "table.", "evaluation.", "ablation.", "method.name", *OF_THE_MACHINE),
     *(
         "schedule.checkpoint_every",
         "schedule.evaluate_every",

@@ -232,7 +232,8 @@ class RunConfig:
     """Threads of torch and the native core. None: torch's default."""
     processes: int | None = None
     """Trainings of one run that do not wait for each other (of further models, of teachers) pass at once in so many
-    processes, which share the threads. None: as many as there are such trainings, threads and memory for."""
+    processes at most, which share the threads. None: as many as there are such trainings, threads and memory for; a
+    job of a sweep has one."""
 
     def __post_init__(self) -> None:
         refuse_below("seed", self.seed, 0)

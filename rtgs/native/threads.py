@@ -24,10 +24,10 @@ _lent: ContextVar[Callable[[], int] | None] = ContextVar("lent", default=None)  
 
 
 def threads() -> int:
-    """Of every kernel: as many as torch has, or had before :func:`serial_torch`, in which another process of the run
-    may have lent more (:func:`borrow`). No bit of a kernel's result depends on it."""
-    own, lent = _kernels.get(), _lent.get()
-    return settled_threads() if own is None or lent is None else max(own, lent())
+    """Of every kernel: as many as torch has, or had before :func:`serial_torch`, or more that are lent
+    (:func:`borrow`). No bit of a kernel's result depends on it."""
+    lent = _lent.get()
+    return settled_threads() if lent is None else max(settled_threads(), lent())
 
 
 def settled_threads() -> int:
@@ -37,7 +37,7 @@ def settled_threads() -> int:
 
 @contextmanager
 def borrow(now: Callable[[], int]) -> Iterator[None]:
-    """While the block runs, kernels in :func:`serial_torch` take as many threads as ``now`` says, if that is more."""
+    """While the block runs, kernels take as many threads as ``now`` says, if that is more than torch has."""
     before = _lent.set(now)
     try:
         yield

@@ -1,8 +1,8 @@
 """One run in several processes of this machine: trainings that do not wait for each other pass at once.
 
 The run's own process goes through the plan as ever. Beside it processes take the trainings, and the meshes that
-trainings wait for, that come next. Each has an even share of the threads; what one does not need, because it is done or
-waits, the kernels of the others take (:func:`rtgs.native.threads.borrow`), which changes no bit of their results.
+trainings wait for, that come next. Each has an even share of the threads; what another does not need, because it is
+done or waits, its kernels take (:func:`rtgs.native.threads.borrow`), which changes no bit of their results.
 """
 
 from __future__ import annotations
@@ -14,8 +14,9 @@ import multiprocessing
 import os
 import signal
 import sys
+import time
 from collections.abc import Iterator
-from concurrent.futures import BrokenExecutor, CancelledError, Future, ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from contextlib import contextmanager, redirect_stderr, suppress
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
@@ -31,25 +32,31 @@ from rtgs.workflow.step import Step, StepFailed
 from rtgs.workflow.worker import WorkerJob
 
 MESHES = "extract_mesh"
+_GRACE_SECONDS = 5.0  # for what a helper is at to be closed
 log = logging.getLogger("rtgs.workflow")
 
 
 def processes_for(plan: Plan, threads: int) -> int:
     """As many as there are trainings that could begin at once, at most one for each of ``threads`` and for each
-    :data:`rtgs.workflow.spread.JOB_BYTES` of the machine's memory."""
-    todo = {each.step.fingerprint: each.step for each in plan if not each.hit and not each.remote}
-    late: set[str] = set()  # after a training that is to be run
+    :data:`rtgs.workflow.spread.JOB_BYTES` of the machine's memory. 1 where no training is left.
+
+    Trainings count whether they are done or not: who goes on with a run has the threads that it began with.
+    """
+    late: set[str] = set()  # trainings, and what waits for one
     first = 0
-    for fingerprint, step in todo.items():
+    for planned in plan:
+        step = planned.step
         training = training_steps(step.recipe) is not None
         waits = any(other.fingerprint in late for other in step.upstream)
         first += training and not waits
         if training or waits:
-            late.add(fingerprint)
-    if multiprocessing.current_process().daemon:  # a worker of somebody's, which may have no children
+            late.add(step.fingerprint)
+    most = min(first, threads, machine_cores())
+    left = any(not planned.hit and _worth(planned.step) for planned in plan)
+    if most < 2 or not left or multiprocessing.current_process().daemon:  # somebody's worker may have no children
         return 1
     memory = machine_memory() or float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    return max(1, min(first, threads, machine_cores(), int(memory // JOB_BYTES)))
+    return max(1, min(most, int(memory // JOB_BYTES)))
 
 
 def execute_beside(executor: InlineExecutor, plan: Plan, job: WorkerJob, processes: int) -> tuple[StepResult, ...]:
@@ -62,17 +69,16 @@ def execute_beside(executor: InlineExecutor, plan: Plan, job: WorkerJob, process
     """
     import torch
 
-    before = torch.get_num_threads()
-    board = _Board(plan, executor, job.threads, processes)
-    each = board.each
+    from rtgs.native.threads import borrow
+
+    board, before = _Board(plan, executor, job.threads, processes), torch.get_num_threads()
+    log.info("%d processes side by side, torch with %d of %d threads in each", processes, board.each, job.threads)
     try:
-        with _helpers(board, job, processes - 1) as helpers:
-            while step := board.take():
-                helpers.offer()
-                torch.set_num_threads(each if _worth(step) else board.free_threads)
-                with board.borrowed():
-                    result = executor.ensure(step, board.position(step), board.executed)
-                board.finish(result)
+        with borrow(_Share(board.busy, job.threads)), _helpers(board, job, processes - 1):
+            result = None
+            while step := board.take(result):
+                torch.set_num_threads(board.each if _worth(step) else board.free_threads)
+                result = executor.ensure(step, board.position(step), board.executed)
     finally:
         torch.set_num_threads(before)
     return tuple(board.results[planned.step.fingerprint] for planned in plan)
@@ -83,8 +89,19 @@ def _worth(step: Step) -> bool:
     return training_steps(step.recipe) is not None or step.needs_of == MESHES
 
 
+@dataclass(frozen=True)
+class _Share:
+    """Threads that a process may take now."""
+
+    busy: Any  # how many processes of the run are at work, in memory that they share
+    threads: int  # of all of them together
+
+    def __call__(self) -> int:
+        return self.threads // max(self.busy.value, 1)
+
+
 class _Board:
-    """What is done, what is being done, and what waits; for this thread and the one that hears of the helpers."""
+    """What is done, what is being done, and what waits; for this thread and those of the helpers."""
 
     def __init__(self, plan: Plan, executor: InlineExecutor, threads: int, processes: int) -> None:
         self.results: dict[str, StepResult] = {}
@@ -96,6 +113,7 @@ class _Board:
         self._todo = {planned.step.fingerprint for planned in plan if not planned.hit}
         self._beside: dict[str, Step] = {}
         self._failed: StepFailed | None = None
+        self._waits, self._ended = True, False  # this thread for a step; everything
         self._clock = PlanClock(plan, Expectation(executor.store, self.each), processes)
 
     @property
@@ -115,67 +133,76 @@ class _Board:
         number = self._numbers[step.fingerprint]
         return f"[{number}, {spoken(self._clock.left())} left of the plan]" if self._is_to_do(step) else f"[{number}]"
 
-    @contextmanager
-    def borrowed(self) -> Iterator[None]:
-        """Kernels take what no other process needs."""
-        from rtgs.native.threads import borrow
-
-        with borrow(lambda: self._threads // max(self.busy.value, 1)):
-            yield
-
-    def take(self) -> Step | None:
-        """The next step of this process, as soon as there is one; None: all are done.
+    def take(self, result: StepResult | None = None) -> Step | None:
+        """The next step of this process, as soon as there is one; None: all are done. ``result``: of the one before,
+        so that what waited for it is not taken by another process.
 
         Raises:
             StepFailed: one in another process.
         """
         with self.changed:
+            if result:
+                self._finish(result)
             while not self._failed:
                 step = next((step for step in self._waiting if self._is_ready(step)), None)
                 if step or not self._beside:
                     break
-                self._count(waits=True)
-                log.info("waiting for %s", ", ".join(other.label for other in self._beside.values()))
+                self._waits = True
+                self._count()
+                names = ", ".join(other.label for other in self._beside.values())
+                log.info("waiting for %s, %s left of the plan", names, spoken(self._clock.left()))
                 self.changed.wait()
             else:
                 raise self._failed
+            self._waits = False
             if step:
                 self._waiting.remove(step)
             self._count()
             return step
 
     def take_beside(self) -> Step | None:
-        """The next step that a helper may have now."""
+        """The next step of a helper, as soon as there is one; None: there will be none."""
         with self.changed:
-            left = (step for step in self._waiting if _worth(step) and self._is_to_do(step))
-            step = next((step for step in left if self._is_ready(step)), None)
-            if step is None:
-                return None
-            self._waiting.remove(step)
-            self._beside[step.fingerprint] = step
-            self._count()
-            log.info("%s %s in a process beside this one", self.position(step), step.label)
-            return step
-
-    def finish(self, result: StepResult) -> None:
-        """A step is in the store."""
-        with self.changed:
-            self.results[result.step.fingerprint] = result
-            self._clock.finish(result.step.fingerprint, result.duration if result.executed else None)
+            while not (self._failed or self._ended):
+                left = (step for step in self._waiting if _worth(step) and self._is_to_do(step))
+                step = next((step for step in left if self._is_ready(step)), None)
+                if step and not self._waits:  # else it is for this thread
+                    self._waiting.remove(step)
+                    self._beside[step.fingerprint] = step
+                    self._count()
+                    log.info("%s %s in a process beside this one", self.position(step), step.label)
+                    return step
+                self.changed.wait()
+            return None
 
     def leave(self, step: Step, result: StepResult | None = None, failed: StepFailed | None = None) -> None:
-        """A helper is no longer at ``step``: with its result, an error, or, when it was killed, neither."""
+        """A helper is no longer at ``step``: with its result, an error, or, where it could not go on, neither."""
         with self.changed:
             del self._beside[step.fingerprint]
             if result:
-                self.finish(result)
+                self._finish(replace(result, step=step))  # not its copy
                 log.info("%s %s done in %.1f s beside", self.position(step), step.label, result.duration)
             elif failed:
                 self._failed = failed
             else:
                 self._waiting.insert(0, step)
             self._count()
+
+    def end(self) -> None:
+        """Nobody takes another step."""
+        with self.changed:
+            self._ended = True
             self.changed.notify_all()
+
+    @property
+    def is_over(self) -> bool:
+        """Ended, with whatever a helper is at."""
+        with self.changed:
+            return self._ended
+
+    def _finish(self, result: StepResult) -> None:
+        self.results[result.step.fingerprint] = result
+        self._clock.finish(result.step.fingerprint, result.duration if result.executed else None)
 
     def _is_ready(self, step: Step) -> bool:
         return all(other.fingerprint in self.results for other in step.upstream)
@@ -183,81 +210,69 @@ class _Board:
     def _is_to_do(self, step: Step) -> bool:
         return step.fingerprint in self._todo
 
-    def _count(self, *, waits: bool = False) -> None:
-        self.busy.value = len(self._beside) + (not waits)
+    def _count(self) -> None:
+        """Who is at work has changed."""
+        self.busy.value = max(1, len(self._beside) + (not self._waits))
+        self.changed.notify_all()
 
 
-class _Helpers:
-    """Processes that do what the board has for them."""
+class _Helper(Thread):
+    """A process, and the thread of the run that gives it steps and hears of them."""
 
-    def __init__(self, board: _Board, pool: ProcessPoolExecutor, count: int) -> None:
-        self._board, self._pool, self._free = board, pool, count
-        self.ended = False
+    def __init__(self, board: _Board, theirs: Connection, job: WorkerJob) -> None:
+        super().__init__(daemon=True)
+        self._board = board
+        context, begin = multiprocessing.get_context("spawn"), (theirs, board.busy, job, board.each)
+        self._pool = ProcessPoolExecutor(1, context, _begin, begin)  # its process starts with the first step
 
-    def offer(self) -> None:
-        """Each that has nothing to do gets a step, where there is one."""
-        with self._board.changed:
-            while self._free > 0 and not self.ended and (step := self._board.take_beside()):
-                self._free -= 1
-                try:
-                    future = self._pool.submit(_ensure, step, self._board.position(step))
-                except BrokenExecutor:
-                    self._lost(step)
-                else:
-                    future.add_done_callback(lambda future, step=step: self._heard(step, future))
+    def run(self) -> None:
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # for the process: the run ends it
+        with self._pool:
+            while step := self._board.take_beside():
+                if not self._do(step):
+                    return
 
-    def _heard(self, step: Step, future: Future[StepResult]) -> None:
-        with self._board.changed:
-            if self.ended:
-                return
-            try:
-                result = replace(future.result(), step=step)  # not its copy
-            except (BrokenExecutor, CancelledError):
-                self._lost(step)
-            except Exception as error:
-                failed = error if isinstance(error, StepFailed) else StepFailed(step, error)
-                log.error("%s; the run ends with the step that it is at", failed)
-                self._board.leave(step, failed=failed)
-            else:
-                self._free += 1
-                self._board.leave(step, result)
-                self.offer()
-
-    def _lost(self, step: Step) -> None:
-        """A dead process breaks the pool: the run's own goes on alone."""
-        self._free = 0
-        log.warning("the process beside this one that was at %s was killed, %s here", step.label, IF_MEMORY)
-        self._board.leave(step)
+    def _do(self, step: Step) -> bool:
+        """False: the process cannot go on."""
+        result = failed = None
+        try:
+            result = self._pool.submit(_ensure, step, self._board.position(step)).result()
+        except StepFailed as error:
+            failed = error
+            if not self._board.is_over:
+                log.error("%s; the run ends with the step that it is at", error)
+        except BaseException as error:  # of the process; the step itself only raises the above
+            what = f"was killed, {IF_MEMORY}" if isinstance(error, BrokenExecutor) else f"cannot do it: {error!r}"
+            if not self._board.is_over:
+                log.warning("%s: the process beside this one %s; it is done here", step.label, what)
+        self._board.leave(step, result, failed)
+        return result is not None
 
 
 @contextmanager
-def _helpers(board: _Board, job: WorkerJob, count: int) -> Iterator[_Helpers]:
+def _helpers(board: _Board, job: WorkerJob, count: int) -> Iterator[None]:
     """They end with the block, and with this process however it ends."""
-    context = multiprocessing.get_context("spawn")
-    theirs, ours = context.Pipe(duplex=False)
-    pool = ProcessPoolExecutor(count, context, _begin, (theirs, board.busy, job, board.each))
-    helpers = _Helpers(board, pool, count)
+    theirs, ours = multiprocessing.get_context("spawn").Pipe(duplex=False)
+    helpers = [_Helper(board, theirs, job) for _ in range(count)]
     try:
-        yield helpers
+        for helper in helpers:
+            helper.start()
+        yield
     finally:
-        with board.changed:
-            helpers.ended = True
+        board.end()
         ours.close()
-        pool.shutdown(wait=True, cancel_futures=True)
+        for helper in helpers:
+            helper.join()
         theirs.close()
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Self:
     """A helper, in its process."""
 
     executor: InlineExecutor  # what it has read stays for its next step
-    busy: Any  # how many processes of the run are at work
-    threads: int  # of all of them together
-
-    def share(self) -> int:
-        """Threads that it may take now."""
-        return self.threads // max(self.busy.value, 1)
+    share: _Share
+    works: bool = False
 
 
 _self: list[_Self] = []
@@ -267,18 +282,25 @@ def _begin(run: Connection, busy: Any, job: WorkerJob, each: int) -> None:
     """In a new helper; ``each``: threads of one."""
     import torch
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all; the run ends its helpers
-    Thread(target=_end_with, args=(run,), daemon=True).start()
-    share_one_heap()
+    share_one_heap()  # before any thread has one
+    signal.signal(signal.SIGTERM, _stop)
     torch.set_num_threads(each)
-    _self.append(_Self(job.executor(), busy, job.threads))
+    _self.append(_Self(job.executor(), _Share(busy, job.threads)))
+    Thread(target=_end_with, args=(run,), daemon=True).start()
 
 
 def _end_with(run: Connection) -> None:
-    """The run closed its end, or is dead: what this helper was at stays at its last checkpoint."""
+    """The run closed its end, or is dead: what this helper is at is closed at its last checkpoint."""
     with suppress(EOFError, OSError):
         run.recv()
+    if _self[0].works:
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(_GRACE_SECONDS)
     os._exit(1)
+
+
+def _stop(number: int, frame: object) -> None:
+    raise KeyboardInterrupt
 
 
 class _Named(io.TextIOBase):
@@ -302,5 +324,12 @@ def _ensure(step: Step, position: str) -> StepResult:
     """In a helper: one step, whose upstream is in the store."""
     from rtgs.native.threads import borrow
 
-    with borrow(_self[0].share), redirect_stderr(_Named(step.name, sys.stderr)):
-        return _self[0].executor.ensure(step, position, frozenset())
+    me = _self[0]
+    me.works = True
+    try:
+        with borrow(me.share), redirect_stderr(_Named(step.name, sys.stderr)):
+            return me.executor.ensure(step, position, frozenset())
+    except KeyboardInterrupt:  # everything is closed
+        os._exit(1)
+    finally:
+        me.works = False

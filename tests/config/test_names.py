@@ -22,7 +22,15 @@ def test_a_name_carries_what_was_overridden():
 
 
 def test_where_results_go_is_no_part_of_it():
-    words = ("threads=1", "tracking=off", "tracking.experiment=mine", "paths.remote=/x", "table.name=t", "judge=none")
+    words = (
+        "threads=1",
+        "processes=2",
+        "tracking=off",
+        "tracking.experiment=mine",
+        "paths.remote=/x",
+        "table.name=t",
+        "judge=none",
+    )
     assert name_of("scene=fox", *words) == "fox-rtgs-quick"
 
 

@@ -80,6 +80,26 @@ def train_in_vain(params: Training, context: StepContext) -> None:
     raise ValueError(f"{params.name} cannot be trained")
 
 
+def train_and_leave(params: Training, context: StepContext) -> None:
+    train(params, context)
+    if os.getpid() != int(os.environ["RUN_PID"]):
+        sys.exit(3)
+
+
+def train_and_tell(params: Training, context: StepContext) -> None:
+    train(params, context)
+    mark(params.root, "train_own-done")
+
+
+def train_until_told(params: Training, context: StepContext) -> None:
+    """Closes what it opened when it is interrupted."""
+    try:
+        train(params, context)
+    except KeyboardInterrupt:
+        mark(params.root, f"{params.name}-closed")
+        raise
+
+
 def train_and_die(params: Training, context: StepContext) -> None:
     """Killed the first time."""
     first = not (context.partial / "checkpoint").exists()
@@ -220,6 +240,56 @@ def test_what_a_killed_process_was_at_is_done_by_the_run(tmp_path, caplog):
     assert any("was killed" in record.getMessage() and two.label in record.getMessage() for record in caplog.records)
 
 
+def test_the_others_go_on_beside_one_that_was_killed(tmp_path):
+    capture, one, _ = crossed(tmp_path)
+    dead = training(tmp_path, "member_1", capture, waits_for=("member_2-began",), run=train_and_die)
+    alive = training(tmp_path, "member_2", capture, waits_for=("train_own-done",))
+    one = training(tmp_path, "train_own", capture, waits_for=("member_1-began", "member_2-began"))
+    first = training(tmp_path, "train_last", one, run=train_and_tell)
+    results = execute(tmp_path, make_plan((first, dead, alive), Store(tmp_path / "store")), processes=3, threads=3)
+    pids = {result.step.name: facts(result)["pid"] for result in results}
+    assert pids["member_1"] == pids["train_own"] == pids["train_last"] == os.getpid()
+    assert pids["member_2"] == int((tmp_path / "member_2-began").read_text())  # never begun again
+    assert trained(tmp_path) == ["member_1", "member_1", "member_2", "train_last", "train_own"]
+
+
+@pytest.mark.parametrize("how", ["leaves", "cannot be sent"])
+def test_what_cannot_be_done_beside_is_done_by_the_run(tmp_path, how, caplog, monkeypatch):
+    monkeypatch.setenv("RUN_PID", str(os.getpid()))
+    capture, one, two = crossed(tmp_path)
+    waits, run = (), train_and_leave
+    if how == "cannot be sent":
+        run = lambda params, context: train(params, context)  # noqa: E731  (no name to be found by)
+        one = training(tmp_path, "train_own", capture)
+    two = training(tmp_path, "member_1", capture, waits_for=waits, run=run)
+    with caplog.at_level(logging.WARNING, "rtgs.workflow"):
+        results = execute(tmp_path, make_plan((one, two), Store(tmp_path / "store")))
+    assert facts(results[2])["pid"] == os.getpid()
+    assert any("cannot do it" in record.getMessage() for record in caplog.records)
+
+
+def test_who_goes_on_late_has_the_threads_it_began_with(tmp_path):
+    store = Store(tmp_path / "store")
+    capture, one, two = crossed(tmp_path)
+    InlineExecutor(store).execute(make_plan((training(tmp_path, "member_1", capture),), store))
+    plan = make_plan((one, two), store)
+    results = execute(tmp_path, plan)
+    assert [result.executed for result in results] == [False, True, False]
+    assert facts(results[1]) | {"inputs": 0} == {"pid": os.getpid(), "threads": 1, "inputs": 0}
+
+
+def test_what_a_helper_is_at_is_closed_when_the_run_ends(tmp_path):
+    capture, one, two = crossed(tmp_path, run=train_in_vain)
+    waits = ("train_own-began", "never")
+    two = training(tmp_path, "member_1", capture, waits_for=waits, run=train_until_told)
+    store = Store(tmp_path / "store")
+    with pytest.raises(StepFailed, match="train_own cannot be trained"):
+        execute(tmp_path, make_plan((one, two), store))
+    assert (tmp_path / "member_1-closed").exists()
+    assert not store.discard_attempts(two)  # nothing that looks as if the system had killed it
+    assert not is_there(int((tmp_path / "member_1-began").read_text()))
+
+
 def test_no_process_outlives_a_run_that_was_killed(tmp_path):
     script = (
         "import sys, pathlib; sys.path.insert(0, sys.argv[2]); import test_beside as t\n"
@@ -269,4 +339,6 @@ def test_as_many_processes_as_trainings_that_can_begin(tmp_path, monkeypatch):
     monkeypatch.setattr(beside, "machine_cores", lambda: 16)
     assert processes_for(make_plan((capture,), store), 16) == 1
     InlineExecutor(store).execute(make_plan(first[:2], store))
-    assert processes_for(make_plan((after,), store), 16) == 1
+    assert processes_for(make_plan((after,), store), 16) == 3  # each goes on with the threads it began with
+    InlineExecutor(store).execute(make_plan((after,), store))
+    assert processes_for(make_plan((after, Step("new_page", 1, Other("page"), other, (after,))), store), 16) == 1

@@ -29,6 +29,7 @@ def words(capture) -> list[str]:
         ("scene.path=/no/such/folder", ["capture folder /no/such/folder does not exist"]),
         ("scene=/no/such/folder", ["capture folder /no/such/folder does not exist", "correct scene.path"]),
         ("threads=0", ["threads=0 must be at least 1"]),
+        ("processes=0", ["processes=0 must be at least 1"]),
         ("method.name=3dgz", ["method.name is '3dgz'", "2dgs"]),
     ],
 )

@@ -9,6 +9,7 @@ import pytest
 from pipelines.publishing import against_paper
 from pipelines.publishing.against_paper import keys_of, ways_of
 from rtgs.config import compose
+from rtgs.config.schema import OF_THE_MACHINE
 from rtgs.core.decisions import Decision
 
 SCENE = "scene=nu_nerf/ballstatue"
@@ -25,6 +26,12 @@ def differing(row: str, *words: str) -> dict[str, str]:
 @pytest.mark.parametrize("row", ["rtgs_printed", "rtgs_printed, no_mesh_guide", "3dgs", "envgs"])
 def test_the_paper_differs_from_itself_in_nothing(row: str):
     assert differing(row, "preset=paper") == {}
+
+
+def test_where_and_how_a_run_is_made_is_no_difference():
+    words = {"name": "mine", "threads": 1, "processes": 1, "view": "true"}
+    assert words.keys() == set(OF_THE_MACHINE)
+    assert differing("rtgs_printed", "preset=paper", *(f"{key}={value}" for key, value in words.items())) == {}
 
 
 def test_a_short_run_differs_in_more_than_its_length():

@@ -26,6 +26,7 @@ from rtgs.runs.training import CHECKPOINT_FOLDER, load_method
 from rtgs.runs.views import read_render
 from rtgs.scenes.canonical import read_scene
 from rtgs.train.checkpoint import load_checkpoint
+from rtgs.workflow import beside
 from rtgs.workflow.manifest import Manifest
 from tests.pipelines.app_cases import QUICK, _in_root, capture, finished, folders, root  # noqa: F401  (fixtures)
 
@@ -55,21 +56,23 @@ def test_a_picture_is_the_mean_of_what_the_models_show(together):
         assert torch.equal(found.depth, tensors["depth"])
 
 
-def test_models_trained_side_by_side_are_the_same(together, capture, tmp_path, capfd):
+def test_models_trained_side_by_side_are_the_same(together, capture, tmp_path, capfd, monkeypatch):
+    monkeypatch.setattr(beside, "machine_cores", lambda: 2)
+    monkeypatch.setattr(beside, "machine_memory", lambda: 8e9)
     words = [word for word in THREE if word != "threads=1"]
-    beside = folders(finished(tmp_path, capture, (*words, "threads=2"), "together"))
+    at_once = folders(finished(tmp_path, capture, (*words, "threads=2"), "together"))
     lines = capfd.readouterr().err.splitlines()
     (first, *_) = (line for line in lines if line.endswith("in a process beside this one"))
     assert "member_1" in first
     assert any(line.startswith("member_1: diffuse: step 12/12") for line in lines)
     one_by_one = folders(together)
-    assert beside.keys() == one_by_one.keys()
+    assert at_once.keys() == one_by_one.keys()
     for name in ("train_diffuse", "member_1", "member_2"):
-        models = (load_checkpoint(made[name] / CHECKPOINT_FOLDER).tensors for made in (beside, one_by_one))
+        models = (load_checkpoint(made[name] / CHECKPOINT_FOLDER).tensors for made in (at_once, one_by_one))
         same, own = (dict(tensors) for tensors in models)
         assert same.keys() == own.keys()
         assert all(torch.equal(same[key], own[key]) for key in own)
-    first, second = (sorted(made["render"].glob("**/*.safetensors")) for made in (beside, one_by_one))
+    first, second = (sorted(made["render"].glob("**/*.safetensors")) for made in (at_once, one_by_one))
     assert [path.read_bytes() for path in first] == [path.read_bytes() for path in second]
     assert first
 
