@@ -300,7 +300,9 @@ def _end_with(run: Connection) -> None:
 
 
 def _stop(number: int, frame: object) -> None:
-    raise KeyboardInterrupt
+    """SIGTERM: from :func:`_end_with`, or to the whole group."""
+    if _self[0].works:
+        raise KeyboardInterrupt
 
 
 class _Named(io.TextIOBase):
