@@ -12,7 +12,7 @@ import pytest
 import torch
 from training_cases import small_method, small_scene, small_schedule, small_trainer
 
-from rtgs.native.threads import threads
+from rtgs.native.threads import borrow, threads
 from rtgs.train import trainer as trainer_module
 from rtgs.train.checkpoint import load_newest, scene_digest
 from rtgs.train.guard import TrainingDiverged
@@ -92,6 +92,20 @@ def test_torch_is_serial_while_it_trains_on_small_pictures_alone(small: bool, mo
     finally:
         torch.set_num_threads(before)
     assert found == [*[(3, 1 if small else 3)] * 2, (3, 3)]
+
+
+def test_a_checkpoint_tells_threads_of_its_own_not_those_lent(tmp_path: Path):
+    """Which change no bit: who resumes with the others gone is told nothing."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        with borrow(lambda: 5):
+            small_trainer(schedule=small_schedule(2), checkpoint_dir=tmp_path).run()
+    finally:
+        torch.set_num_threads(before)
+    newest = load_newest(tmp_path, warn=pytest.fail)
+    assert newest is not None
+    assert newest.record.threads == 2
 
 
 def test_equal_seeds_give_equal_surfels_and_others_do_not():

@@ -20,7 +20,7 @@ from rtgs.workflow import NOT_IN_RECIPE, InlineExecutor, Plan, Step, StepContext
 from rtgs.workflow.beside import execute_beside, processes_for
 from rtgs.workflow.worker import WorkerJob
 
-PATIENCE = 60.0
+PATIENCE = 120.0
 
 
 @dataclass(frozen=True)
