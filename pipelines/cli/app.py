@@ -151,6 +151,7 @@ def _executed(run: _Run, executor: InlineExecutor) -> tuple[StepResult, ...]:
     launcher spreads the work."""
     import torch
 
+    from rtgs.native.threads import borrow
     from rtgs.workflow.beside import execute_beside, processes_for
 
     threads = torch.get_num_threads()
@@ -158,7 +159,7 @@ def _executed(run: _Run, executor: InlineExecutor) -> tuple[StepResult, ...]:
     processes = 1 if run.membership.sweep or wanted == 1 else processes_for(run.plan, min(wanted, threads))
     if processes == 1:
         return executor.execute(run.plan)
-    return execute_beside(executor, run.plan, worker_job(run.config, threads), processes)
+    return execute_beside(executor, run.plan, worker_job(run.config, threads), processes, borrow)
 
 
 def open_tracker(config: RunConfig) -> Tracking:

@@ -2,7 +2,7 @@
 
 The run's own process goes through the plan as ever. Beside it processes take the trainings, and the meshes that
 trainings wait for, that come next. Each has an even share of the threads; what another does not need, because it is
-done or waits, its kernels take (:func:`rtgs.native.threads.borrow`), which changes no bit of their results.
+done or waits, its kernels take (``lending``), which changes no bit of their results.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
-from contextlib import contextmanager, redirect_stderr, suppress
+from contextlib import AbstractContextManager, contextmanager, redirect_stderr, suppress
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from threading import Condition, Thread
@@ -33,6 +33,8 @@ from rtgs.workflow.worker import WorkerJob
 
 MESHES = "extract_mesh"
 _GRACE_SECONDS = 5.0  # for what a helper is at to be closed
+Lending = Callable[[Callable[[], int]], AbstractContextManager[object]]
+"""While its context is open, kernels take as many threads as the function says (``rtgs.native.threads.borrow``)."""
 log = logging.getLogger("rtgs.workflow")
 
 
@@ -59,22 +61,22 @@ def processes_for(plan: Plan, threads: int) -> int:
     return max(1, min(most, int(memory // JOB_BYTES)))
 
 
-def execute_beside(executor: InlineExecutor, plan: Plan, job: WorkerJob, processes: int) -> tuple[StepResult, ...]:
+def execute_beside(
+    executor: InlineExecutor, plan: Plan, job: WorkerJob, processes: int, lending: Lending
+) -> tuple[StepResult, ...]:
     """:meth:`InlineExecutor.execute` with ``processes`` in all, this one among them.
 
-    ``job.threads``: of all of them together.
+    ``job.threads``: of all of them together. ``lending``: a function of a module, for the other processes too.
 
     Raises:
         StepFailed: a step raised, here or in another process.
     """
     import torch
 
-    from rtgs.native.threads import borrow
-
     board, before = _Board(plan, executor, job.threads, processes), torch.get_num_threads()
     log.info("%d processes side by side, torch with %d of %d threads in each", processes, board.each, job.threads)
     try:
-        with borrow(_Share(board.busy, job.threads)), _helpers(board, job, processes - 1):
+        with lending(_Share(board.busy, job.threads)), _helpers(board, job, lending, processes - 1):
             result = None
             while step := board.take(result):
                 torch.set_num_threads(board.each if _worth(step) else board.free_threads)
@@ -219,10 +221,11 @@ class _Board:
 class _Helper(Thread):
     """A process, and the thread of the run that gives it steps and hears of them."""
 
-    def __init__(self, board: _Board, theirs: Connection, job: WorkerJob) -> None:
+    def __init__(self, board: _Board, theirs: Connection, job: WorkerJob, lending: Lending) -> None:
         super().__init__(daemon=True)
         self._board = board
-        context, begin = multiprocessing.get_context("spawn"), (theirs, board.busy, job, board.each)
+        begin = (theirs, board.busy, job, board.each, lending)
+        context = multiprocessing.get_context("spawn")
         self._pool = ProcessPoolExecutor(1, context, _begin, begin)  # its process starts with the first step
 
     def run(self) -> None:
@@ -250,10 +253,10 @@ class _Helper(Thread):
 
 
 @contextmanager
-def _helpers(board: _Board, job: WorkerJob, count: int) -> Iterator[None]:
+def _helpers(board: _Board, job: WorkerJob, lending: Lending, count: int) -> Iterator[None]:
     """They end with the block, and with this process however it ends."""
     theirs, ours = multiprocessing.get_context("spawn").Pipe(duplex=False)
-    helpers = [_Helper(board, theirs, job) for _ in range(count)]
+    helpers = [_Helper(board, theirs, job, lending) for _ in range(count)]
     try:
         for helper in helpers:
             helper.start()
@@ -272,20 +275,21 @@ class _Self:
 
     executor: InlineExecutor  # what it has read stays for its next step
     share: _Share
+    lending: Lending
     works: bool = False
 
 
 _self: list[_Self] = []
 
 
-def _begin(run: Connection, busy: Any, job: WorkerJob, each: int) -> None:
+def _begin(run: Connection, busy: Any, job: WorkerJob, each: int, lending: Lending) -> None:
     """In a new helper; ``each``: threads of one."""
     import torch
 
     share_one_heap()  # before any thread has one
     signal.signal(signal.SIGTERM, _stop)
     torch.set_num_threads(each)
-    _self.append(_Self(job.executor(), _Share(busy, job.threads)))
+    _self.append(_Self(job.executor(), _Share(busy, job.threads), lending))
     Thread(target=_end_with, args=(run,), daemon=True).start()
 
 
@@ -324,12 +328,10 @@ class _Named(io.TextIOBase):
 
 def _ensure(step: Step, position: str) -> StepResult:
     """In a helper: one step, whose upstream is in the store."""
-    from rtgs.native.threads import borrow
-
     me = _self[0]
     me.works = True
     try:
-        with borrow(me.share), redirect_stderr(_Named(step.name, sys.stderr)):
+        with me.lending(me.share), redirect_stderr(_Named(step.name, sys.stderr)):
             return me.executor.ensure(step, position, frozenset())
     except KeyboardInterrupt:  # everything is closed
         os._exit(1)
