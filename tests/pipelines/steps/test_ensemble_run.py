@@ -77,6 +77,17 @@ def test_models_trained_side_by_side_are_the_same(together, capture, tmp_path, c
     assert first
 
 
+def test_processes_can_be_forbidden(capture, tmp_path, capfd, monkeypatch):
+    monkeypatch.setattr(beside, "machine_cores", lambda: 2)
+    monkeypatch.setattr(beside, "machine_memory", lambda: 8e9)
+    words = [word for word in THREE if word != "threads=1"]
+    finished(tmp_path, capture, (*words, "threads=2", "processes=1"), "alone")
+    lines = capfd.readouterr().err
+    assert "member_1" in lines
+    assert "side by side" not in lines
+    assert "beside" not in lines
+
+
 def test_its_squared_error_is_below_the_mean_of_theirs(together):
     """By what the pictures differ: the mean of the squared distances to their mean."""
     made = folders(together)
