@@ -149,14 +149,15 @@ def _tracked(run: _Run, parent: str) -> RunOutcome:
 def _executed(run: _Run, executor: InlineExecutor) -> tuple[StepResult, ...]:
     """What the store lacks is run, with processes beside this one where that is sooner. A job of a sweep has none: its
     launcher spreads the work."""
+    if run.plan.complete or run.membership.sweep or run.config.processes == 1:  # torch need not be loaded for it
+        return executor.execute(run.plan)
     import torch
 
     from rtgs.native.threads import borrow
     from rtgs.workflow.beside import execute_beside, processes_for
 
     threads = torch.get_num_threads()
-    wanted = run.config.processes or threads
-    processes = 1 if run.membership.sweep or wanted == 1 else processes_for(run.plan, min(wanted, threads))
+    processes = processes_for(run.plan, min(run.config.processes or threads, threads))
     if processes == 1:
         return executor.execute(run.plan)
     return execute_beside(executor, run.plan, worker_job(run.config, threads), processes, borrow)

@@ -75,7 +75,8 @@ def in_threads(work: Callable[..., Result], *items: Iterable) -> list[Result]:
 
 @contextmanager
 def threaded_torch() -> Iterator[None]:
-    """While the block runs, torch's own operations take as many threads as the kernels: for networks."""
+    """While the block runs, torch's own operations take as many threads as the kernels, lent ones apart: for
+    networks."""
     with _torch_threads(settled_threads()):
         yield
 

@@ -31,7 +31,7 @@ from rtgs.workflow.spread import JOB_BYTES, machine_cores, machine_memory
 from rtgs.workflow.step import Step, StepFailed
 from rtgs.workflow.worker import WorkerJob
 
-MESHES = "extract_mesh"
+_MESHES = "extract_mesh"
 _GRACE_SECONDS = 5.0  # for what a helper is at to be closed
 Lending = Callable[[Callable[[], int]], AbstractContextManager[object]]
 """While its context is open, kernels take as many threads as the function says (``rtgs.native.threads.borrow``)."""
@@ -88,7 +88,7 @@ def execute_beside(
 
 def _worth(step: Step) -> bool:
     """Whether another process may take it: it is long, and how much memory it needs is known."""
-    return training_steps(step.recipe) is not None or step.needs_of == MESHES
+    return training_steps(step.recipe) is not None or step.needs_of == _MESHES
 
 
 @dataclass(frozen=True)
